@@ -1,0 +1,36 @@
+"""The virtual patient: glucose, insulin and pramlintide in one body, advanced in steps of 30 s."""
+
+from .gastric import begin_meal, q_sto, rate_of_appearance
+from .glucose import glucose, interstitial
+from .insulin import plasma_insulin
+from .integrate import STEP_MIN, advance
+from .parameters import PARAMETERS, Parameter
+from .patients import Patient, PatientError, cohort, load_patient, pramlintide_sets
+from .pramlintide import eta, plasma_pramlintide
+from .states import STATES, State
+from .variability import SOURCES, MealFactors, Variability
+
+__all__ = [
+    "PARAMETERS",
+    "SOURCES",
+    "STATES",
+    "STEP_MIN",
+    "MealFactors",
+    "Parameter",
+    "Patient",
+    "PatientError",
+    "State",
+    "Variability",
+    "advance",
+    "begin_meal",
+    "cohort",
+    "eta",
+    "glucose",
+    "interstitial",
+    "load_patient",
+    "plasma_insulin",
+    "plasma_pramlintide",
+    "pramlintide_sets",
+    "q_sto",
+    "rate_of_appearance",
+]
