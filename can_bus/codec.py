@@ -118,9 +118,7 @@ class MessageCodec:
             data: exactly `length` bytes; check it before (`Receiver` does).
         """
         word = int.from_bytes(data, "little")
-        values = {
-            name: ((word >> shift & mask) ^ sign) - sign for name, shift, mask, sign, _, _, _ in self._common
-        }
+        values = {name: ((word >> shift & mask) ^ sign) - sign for name, shift, mask, sign, _, _, _ in self._common}
         if self.selector is not None:
             for name, shift, mask, sign, _, _, _ in self._pages.get(values[self.selector], ()):
                 values[name] = ((word >> shift & mask) ^ sign) - sign
