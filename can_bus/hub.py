@@ -1,0 +1,653 @@
+"""The hub: a CAN bus made of one small, single-threaded switch and stream sockets.
+
+It promises what a lockstep bench needs: one order of all frames for every receiver, no frame lost, no own frames
+unless asked for, a joining node that knows from when on it misses nothing, and a loud end when something dies. It
+is no model of the electrical bus: no arbitration by identifier, no bit timing, no error counters.
+
+Run one by hand with ``python -m can_bus.hub unix:/tmp/bus tcp:127.0.0.1:29536``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import select
+import signal
+import socket
+import stat
+import struct
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+import can
+
+from can_bus import hub_wire
+from can_bus.address import Address, BusUrlError, parse_address
+from can_bus.frame import MAX_DATA, RECORD_SIZE, Frame, pack, unpack
+from can_bus.hub_wire import Reason
+from can_bus.link import BaseLink
+
+_log = logging.getLogger("can_bus.hub")
+
+DEFAULT_CAP: Final = 262_144
+_CHUNK: Final = 65536
+_LINGER: Final = 10.0
+_IN: Final = select.EPOLLIN
+_OUT: Final = select.EPOLLOUT
+
+
+class _Client:
+    """One connection: greeting (no hello yet), member (on the bus) or leaving (gets its goodbye)."""
+
+    __slots__ = ("deadline", "echo", "fd", "member", "mute", "name", "out", "partial", "sock", "tcp")
+
+    def __init__(self, sock: socket.socket, name: str, tcp: bool) -> None:
+        self.sock = sock
+        self.fd = sock.fileno()
+        self.name = name
+        self.tcp = tcp
+        self.echo = False
+        self.member = False
+        self.mute = False  # its end is closed: it can't be sent anything, but what it sent may wait to be read
+        self.deadline: float | None = None  # set when it is leaving
+        self.partial = b""
+        self.out = bytearray()
+
+
+class Hub:
+    """A switch for CAN frames that listens on any number of Unix and loopback TCP addresses.
+
+    There are two ways to run it. *Embedded*: a node hosts it, talks through ``local_link()``, and every blocking
+    receive of that link does the switching; while the host computes nothing is forwarded, and in lockstep nobody
+    minds. *Standalone*: ``serve_forever()`` in a process or thread of its own.
+
+    A hub belongs to the thread that drives it. Only ``stop``, ``clients`` and, while another thread is in
+    ``serve_forever``, ``wait_for_clients`` may be used from elsewhere.
+
+    It never holds back a sender, so senders can't deadlock; a reader that falls behind by more than ``cap`` frames
+    is disconnected instead, with an error in the log here and the reason in a ``BusLost`` there.
+    """
+
+    def __init__(self, urls: str | Iterable[str] = (), *, cap: int = DEFAULT_CAP) -> None:
+        """Listen on the URLs at once.
+
+        Args:
+            urls: ``unix:/path``, ``tcp:127.0.0.1:port`` (port 0 chooses one, see ``urls``); none is fine for a
+                hub that has only local links.
+            cap: how many frames the hub keeps for one slow reader before it disconnects it.
+        """
+        self._cap = cap
+        self._epoll = select.epoll()
+        self._listeners: dict[int, tuple[socket.socket, Address]] = {}
+        self._files: list[tuple[Path, int, int]] = []
+        self._clients: dict[int, _Client] = {}
+        self._members: tuple[_Client, ...] = ()
+        self._leaving = 0
+        self._locals: tuple[LocalLink, ...] = ()
+        self._closed = False
+        self._stopping = False
+        self._selected = False
+        self._server: threading.Thread | None = None
+        self._changed = threading.Condition()
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._epoll.register(self._wake, _IN)
+        self.urls: list[str] = []
+        try:
+            for url in [urls] if isinstance(urls, str) else urls:
+                self._listen(parse_address(url))
+        except BaseException:
+            self.close(linger=0.0)
+            raise
+
+    # -- addresses ---------------------------------------------------------------------------------------------
+
+    def _listen(self, address: Address) -> None:
+        listener = socket.socket(address.family, socket.SOCK_STREAM)
+        try:
+            if address.is_tcp:
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                listener.bind(address.target)
+                listener.listen(128)
+                host, port = listener.getsockname()[:2]
+                self.urls.append(f"tcp:[{host}]:{port}" if ":" in host else f"tcp:{host}:{port}")
+            else:
+                self._bind_unix(listener, address)
+                self.urls.append(address.url)
+        except OSError as error:
+            listener.close()
+            if error.errno == errno.EADDRINUSE:
+                raise can.CanInitializationError(f"{address.url}: the address is in use by another program") from error
+            raise can.CanInitializationError(f"{address.url}: cannot listen there: {error.strerror}") from error
+        except BaseException:
+            listener.close()
+            raise
+        listener.setblocking(False)
+        self._listeners[listener.fileno()] = (listener, address)
+        self._epoll.register(listener, _IN)
+
+    def _bind_unix(self, listener: socket.socket, address: Address) -> None:
+        """Create the socket file with mode 0600, never open to others even for an instant.
+
+        A socket file nobody serves any more is replaced. The lock on the directory keeps two starting hubs from
+        each taking the other's new file for a stale one.
+        """
+        path = address.path
+        with _directory_lock(path.parent):
+            if path.is_symlink() or path.exists():
+                if not stat.S_ISSOCK(path.lstat().st_mode):
+                    raise can.CanInitializationError(f"{address.url}: a file that is no socket is in the way")
+                if _is_served(path):
+                    raise can.CanInitializationError(f"{address.url}: another hub is serving this path")
+                path.unlink()
+            os.fchmod(listener.fileno(), 0o600)  # on Linux the file inherits the mode of the unbound socket
+            listener.bind(str(path))
+            path.chmod(0o600)
+            listener.listen(128)
+            status = path.stat()
+        self._files.append((path.absolute(), status.st_dev, status.st_ino))
+
+    # -- driving it --------------------------------------------------------------------------------------------
+
+    def local_link(self, filters: Iterable[int] | None = None) -> LocalLink:
+        """Return a link of the hosting node; its ``recv`` runs the hub. Several are fine, in one thread."""
+        link = LocalLink(self, filters)
+        self._locals = (*self._locals, link)
+        return link
+
+    def serve_forever(self) -> None:
+        """Switch until ``stop`` is called (from a signal handler or another thread)."""
+        with self._changed:
+            self._server = threading.current_thread()
+        try:
+            while not self._stopping:
+                self.poll(None)
+        finally:
+            with self._changed:
+                self._server = None
+                self._changed.notify_all()
+
+    def start(self) -> Self:
+        """Serve in a daemon thread of this process until ``stop`` or ``close``."""
+        thread = threading.Thread(target=self.serve_forever, name="can hub", daemon=True)
+        with self._changed:
+            if self._server is not None:
+                raise ValueError("the hub is already being served")
+            self._server = thread
+        thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Make ``serve_forever`` return; safe in signal handlers and other threads. Does not close the hub."""
+        self._stopping = True
+        self._wake_up()
+
+    def _wake_up(self) -> None:
+        with contextlib.suppress(OSError):
+            os.eventfd_write(self._wake, 1)
+
+    def poll(self, timeout: float | None) -> bool:
+        """Wait up to ``timeout`` seconds (None: for ever) for something to do, do it; False when there was nothing."""
+        if self._closed:
+            raise ValueError("the hub is closed")
+        if self._leaving:
+            timeout = self._expire(timeout)
+        batches: list[tuple[_Client, bytes]] = []
+        events = self._epoll.poll(timeout)
+        for fd, event in events:
+            client = self._clients.get(fd)
+            if client is None:
+                self._other_event(fd)
+                continue
+            if event & _OUT:
+                self._drain(client)
+            if event & ~_OUT:
+                records = self._read(client)
+                if records:
+                    batches.append((client, records))
+        if batches:
+            self._switch(batches)
+        return bool(events)
+
+    def _other_event(self, fd: int) -> None:
+        if fd == self._wake:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._wake)
+        elif fd in self._listeners:
+            listener, address = self._listeners[fd]
+            try:
+                self._accept(*listener.accept(), address)
+            except (BlockingIOError, ConnectionError):
+                pass  # the client went away before we got to it
+            except OSError as error:
+                _log.error("%s: cannot accept a client: %s", address.url, error.strerror)
+
+    # -- clients -----------------------------------------------------------------------------------------------
+
+    @property
+    def clients(self) -> int:
+        """How many clients have been welcomed and are still there (local links are not counted)."""
+        return len(self._members)
+
+    @property
+    def backlog(self) -> int:
+        """How many frames wait in the hub for its slowest reader; at ``cap`` that reader is disconnected."""
+        return max((len(client.out) for client in self._members), default=0) // RECORD_SIZE
+
+    def wait_for_clients(self, count: int, timeout: float) -> None:
+        """Switch until ``count`` clients are on the bus; TimeoutError names those that came."""
+        end = time.monotonic() + timeout
+        while len(self._members) < count:
+            left = end - time.monotonic()
+            if left <= 0:
+                came = ", ".join(client.name for client in self._members) or "none"
+                where, here = " ".join(self.urls), len(self._members)
+                raise TimeoutError(f"{where}: {here} of {count} clients joined within {timeout:g} s ({came})")
+            with self._changed:
+                if self._server not in (None, threading.current_thread()):
+                    if len(self._members) < count:
+                        self._changed.wait(left)
+                    continue
+            self.poll(left)
+
+    def drain(self, below: int = 1, timeout: float = 60.0) -> None:
+        """Switch until fewer than ``below`` frames wait for the slowest reader.
+
+        The host of an embedded hub calls it between steps, so that a recorder slower than the simulation slows the
+        run down in place of being disconnected. TimeoutError after ``timeout`` seconds.
+        """
+        if self.backlog < below:
+            return
+        end = time.monotonic() + timeout
+        while self.backlog >= below:
+            left = end - time.monotonic()
+            if left <= 0:
+                slow = max(self._members, key=lambda client: len(client.out))
+                raise TimeoutError(f"{slow.name} is {self.backlog} frames behind and did not catch up")
+            self.poll(left)
+
+    def _set_members(self, members: Iterable[_Client]) -> None:
+        with self._changed:
+            self._members = tuple(members)
+            self._changed.notify_all()
+
+    def _accept(self, sock: socket.socket, peer: object, address: Address) -> None:
+        sock.setblocking(False)
+        if address.is_tcp:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            name = f"client at {peer}"
+        else:
+            pid, _, _ = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            name = f"client (pid {pid})"
+        client = _Client(sock, f"{name} on {address.url}", address.is_tcp)
+        self._clients[client.fd] = client
+        self._epoll.register(sock, _IN)
+
+    def _read(self, client: _Client) -> bytes:
+        """Return the complete records a member sent, b"" when there are none (or it is gone)."""
+        try:
+            chunk = client.sock.recv(_CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            chunk = b""
+        if not chunk:
+            self._forget(client)
+            return b""
+        if client.deadline is not None:
+            return b""
+        if client.partial:
+            chunk = client.partial + chunk
+            client.partial = b""
+        if not client.member:
+            chunk = self._greet(client, chunk)
+        rest = len(chunk) % RECORD_SIZE
+        if rest and client.member:
+            client.partial = chunk[-rest:]
+            chunk = chunk[:-rest]
+        if not chunk or not client.member:
+            return b""
+        longest = max(chunk[hub_wire.LEN_OFFSET :: RECORD_SIZE])
+        if longest > MAX_DATA:
+            _log.error("%s sent a record of length %d: disconnected", client.name, longest)
+            self._dismiss(client, Reason.MALFORMED, longest)
+            return b""
+        return chunk
+
+    def _greet(self, client: _Client, chunk: bytes) -> bytes:
+        """Answer a hello and return what came behind it; an incomplete hello waits in ``partial``."""
+        if chunk[: len(hub_wire.MAGIC)] != hub_wire.MAGIC[: len(chunk)]:
+            _log.error("%s did not send a hello of this protocol: disconnected", client.name)
+            self._dismiss(client, Reason.NOT_A_CLIENT, 0)
+            return b""
+        if len(chunk) < hub_wire.HELLO.size:
+            client.partial = chunk
+            return b""
+        _, version, flags, pid = hub_wire.HELLO.unpack_from(chunk)
+        if version != hub_wire.VERSION:
+            _log.error("%s speaks protocol version %d, not %d: disconnected", client.name, version, hub_wire.VERSION)
+            self._dismiss(client, Reason.VERSION, hub_wire.VERSION)
+            return b""
+        if client.tcp and pid:
+            client.name += f" (pid {pid})"
+        client.echo = bool(flags & hub_wire.FLAG_ECHO)
+        client.member = True
+        self._push(client, hub_wire.hello(flags))
+        self._set_members((*self._members, client))
+        _log.info("%s joined", client.name)
+        return chunk[hub_wire.HELLO.size :]
+
+    # -- switching ---------------------------------------------------------------------------------------------
+
+    def _switch(self, batches: list[tuple[_Client, bytes]]) -> None:
+        """Forward what was read, in the order it was read, to everybody: this order is the bus's order."""
+        if len(batches) == 1:
+            sender, records = batches[0]
+            for client in self._members:
+                if client is not sender or client.echo:
+                    self._push(client, records)
+        else:
+            for client in self._members:
+                records = b"".join([chunk for sender, chunk in batches if client is not sender or client.echo])
+                if records:
+                    self._push(client, records)
+        if self._locals:
+            for link in self._locals:
+                for _, records in batches:
+                    link.deliver(records)
+
+    def switch_local(self, link: LocalLink, records: bytes) -> None:
+        """Put a batch of a local link on the bus."""
+        for client in self._members:
+            self._push(client, records)
+        if len(self._locals) > 1:
+            for other in self._locals:
+                if other is not link:
+                    other.deliver(records)
+            if self._selected:
+                self._wake_up()
+
+    def _push(self, client: _Client, records: bytes) -> None:
+        out = client.out
+        if not out:
+            if client.mute:
+                return
+            try:
+                sent = client.sock.send(records)
+            except BlockingIOError:
+                sent = 0
+            except OSError:
+                client.mute = True
+                return
+            if sent == len(records):
+                return
+            out += memoryview(records)[sent:]
+            self._epoll.modify(client.fd, _IN | _OUT)
+        else:
+            out += records
+        if len(out) > self._cap * RECORD_SIZE:
+            self._overrun(client)
+
+    def _drain(self, client: _Client) -> None:
+        """Write what waits for a client, as far as it goes."""
+        out = client.out
+        try:
+            while out:
+                with memoryview(out) as view:
+                    sent = client.sock.send(view[: 4 * _CHUNK])
+                del out[:sent]
+        except BlockingIOError:
+            return
+        except OSError:
+            client.mute = True
+            out.clear()
+        if client.deadline is not None:
+            self._farewell(client)
+        elif client.fd in self._clients:
+            self._epoll.modify(client.fd, _IN)
+
+    # -- the end of a client -----------------------------------------------------------------------------------
+
+    def _overrun(self, client: _Client) -> None:
+        frames = len(client.out) // RECORD_SIZE
+        _log.error("%s is too slow, %d frames wait for it (cap %d): disconnected", client.name, frames, self._cap)
+        self._dismiss(client, Reason.OVERRUN, frames)
+
+    def _dismiss(self, client: _Client, reason: Reason, detail: int) -> None:
+        """Take a client off the bus, with a goodbye behind the record that is half sent."""
+        if client.member:
+            self._set_members(member for member in self._members if member is not client)
+        client.member = False
+        client.partial = b""
+        del client.out[len(client.out) % RECORD_SIZE :]
+        client.out += hub_wire.goodbye(reason, detail)
+        client.deadline = time.monotonic() + _LINGER
+        self._leaving += 1
+        if not client.tcp:  # its next send fails at once; on TCP what it sends is read and thrown away
+            with contextlib.suppress(OSError):
+                client.sock.shutdown(socket.SHUT_RD)
+        self._epoll.modify(client.fd, (_IN | _OUT) if client.tcp else _OUT)
+
+    def _farewell(self, client: _Client) -> None:
+        """The goodbye is out. A Unix socket keeps it for the reader; TCP must not be closed over unread input."""
+        if client.tcp and not client.mute:
+            with contextlib.suppress(OSError):
+                client.sock.shutdown(socket.SHUT_WR)
+            self._epoll.modify(client.fd, _IN)
+        else:
+            self._forget(client)
+
+    def _expire(self, timeout: float | None) -> float | None:
+        """Close leaving TCP clients that neither read their goodbye nor hang up; return the wait until the next."""
+        now = time.monotonic()
+        for client in [client for client in self._clients.values() if client.deadline is not None]:
+            assert client.deadline is not None
+            left = client.deadline - now
+            if left <= 0 and client.tcp:
+                self._forget(client)
+            elif client.tcp:
+                timeout = left if timeout is None else min(timeout, left)
+        return timeout
+
+    def _forget(self, client: _Client) -> None:
+        if self._clients.pop(client.fd, None) is None:
+            return
+        if client.deadline is not None:
+            self._leaving -= 1
+        self._epoll.unregister(client.fd)
+        client.sock.close()
+        client.out.clear()
+        if client.member:
+            client.member = False
+            self._set_members(member for member in self._members if member is not client)
+            _log.info("%s left", client.name)
+
+    # -- the end of the hub ------------------------------------------------------------------------------------
+
+    @property
+    def closed(self) -> bool:
+        """Whether ``close`` was called."""
+        return self._closed
+
+    def fileno(self) -> int:
+        """The descriptor to select on when something else must be watched too; readable means: call ``poll(0)``."""
+        self._selected = True
+        return self._epoll.fileno()
+
+    def detach(self, link: LocalLink) -> None:
+        """Forget a local link."""
+        self._locals = tuple(other for other in self._locals if other is not link)
+
+    def close(self, linger: float = 5.0) -> None:
+        """Switch what was sent, deliver what waits, say goodbye, remove the socket files. Calling it again is fine.
+
+        A reader that does not take its frames within ``linger`` seconds in all loses them, with an error in the log
+        here and a ``BusLost`` there.
+        """
+        if self._closed:
+            return
+        server = self._server
+        if server is not None and server is not threading.current_thread():
+            self.stop()
+            server.join()
+        for listener, _ in self._listeners.values():
+            self._epoll.unregister(listener)
+            listener.close()
+        self._listeners.clear()
+        for path, device, inode in self._files:
+            with contextlib.suppress(OSError):
+                status = path.lstat()
+                if (status.st_dev, status.st_ino) == (device, inode):
+                    path.unlink()
+        self._files.clear()
+        end = time.monotonic() + linger
+        while time.monotonic() < end and self.poll(0):
+            pass
+        while any(client.out for client in self._members):
+            left = end - time.monotonic()
+            if left <= 0:
+                break
+            self.poll(left)
+        for client in list(self._clients.values()):
+            self._part(client)
+        self._closed = True
+        self._stopping = True
+        self._epoll.close()
+        os.close(self._wake)
+
+    def _part(self, client: _Client) -> None:
+        if client.member and client.out:
+            _log.error("%s did not take %d frames before the end", client.name, len(client.out) // RECORD_SIZE)
+        if client.member and not client.out and not client.mute:
+            with contextlib.suppress(OSError):
+                client.sock.send(hub_wire.goodbye(Reason.CLOSED))
+        with contextlib.suppress(OSError):
+            client.sock.shutdown(socket.SHUT_WR)
+            for _ in range(64):  # closing TCP over unread input would reset what is on its way
+                if not client.sock.recv(_CHUNK):
+                    break
+        self._forget(client)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(linger=0.0 if kind else 5.0)
+
+
+class LocalLink(BaseLink):
+    """The link of the process that hosts a hub; ``recv`` and ``recv`` alone makes the hub switch."""
+
+    def __init__(self, hub: Hub, filters: Iterable[int] | None) -> None:
+        super().__init__(hub.urls[0] if hub.urls else "hub", filters)
+        self._hub = hub
+        self._pending: list[Frame] = []
+
+    def deliver(self, records: bytes) -> None:
+        """Called by the hub: these records are for this link."""
+        frames = unpack(records)
+        self._pending += frames if self._wanted is None else self._wanted.select(frames)
+
+    def recv(self, timeout: float | None) -> list[Frame]:
+        """Run the hub until frames for this node arrived; see ``Link.recv``."""
+        hub = self._hub
+        if self._dead is not None:
+            raise self._lose("")
+        if hub.closed:
+            raise self._lose("the hub was closed")
+        if not self._pending:
+            if timeout is None:
+                while not self._pending:
+                    hub.poll(None)
+            else:
+                end = time.monotonic() + timeout
+                hub.poll(timeout)
+                while not self._pending and (left := end - time.monotonic()) > 0:
+                    hub.poll(left)
+        frames = self._pending
+        if frames:
+            self._pending = []
+        return frames
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Put the batch on the bus; never blocks."""
+        if self._dead is not None:
+            raise self._lose("")
+        if self._hub.closed:
+            raise self._lose("the hub was closed")
+        if frames:
+            self._hub.switch_local(self, pack(frames))
+
+    def send_packed(self, records: bytes) -> None:
+        """Put on the bus what ``pack`` made."""
+        self._hub.switch_local(self, records)
+
+    def fileno(self) -> int:
+        """The hub's descriptor: it is readable when ``recv(0)`` should be called, which may return nothing."""
+        return self._hub.fileno()
+
+    def close(self) -> None:
+        """Leave the bus; the hub stays."""
+        if self._dead is None:
+            self._closed()
+            self._hub.detach(self)
+
+
+@contextlib.contextmanager
+def _directory_lock(directory: Path) -> Iterator[None]:
+    try:
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise can.CanInitializationError(f"unix:{directory}: {error.strerror}") from error
+    try:
+        with contextlib.suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_served(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:  # a full backlog, or somebody else's socket: in any case not ours to remove
+            return True
+        return True
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve a hub until SIGINT or SIGTERM; the exit status is 2 when an address cannot be used."""
+    parser = argparse.ArgumentParser(prog="python -m can_bus.hub", description="A CAN bus on local stream sockets.")
+    parser.add_argument("urls", nargs="+", metavar="URL", help="unix:/path or tcp:127.0.0.1:port (0: choose one)")
+    parser.add_argument("--cap", type=int, default=DEFAULT_CAP, help="frames kept for a slow reader (%(default)s)")
+    options = parser.parse_args(arguments)
+    logging.basicConfig(format="hub: %(message)s", level=logging.INFO, stream=sys.stderr)
+    try:
+        hub = Hub(options.urls, cap=options.cap)
+    except (BusUrlError, can.CanError) as error:
+        print(f"hub: {error}", file=sys.stderr)
+        return 2
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: hub.stop())
+    with hub:
+        print("serving", *hub.urls, flush=True)
+        hub.serve_forever()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
