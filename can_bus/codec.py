@@ -61,6 +61,7 @@ class MessageCodec:
         data_ids: the 16 E2E data ids, or None for a message without protection.
         fields: signal name -> `Field`, CHECKSUM and COUNTER left out of protected messages.
         selector: name of the multiplexer signal, or None.
+        pages: its code -> the fields that exist only there.
     """
 
     def __init__(self, message: Any) -> None:
@@ -92,13 +93,13 @@ class MessageCodec:
                 self.selector = signal.name
         self._initial = initial
         self._common = tuple(common)
-        self._pages = {key: tuple(fields) for key, fields in pages.items()}
+        self.pages = {key: tuple(fields) for key, fields in pages.items()}
 
     def pack(self, values: Mapping[str, int]) -> int:
-        """The payload as an integer (CHECKSUM and COUNTER zero) from raw values; signals left out keep their start value.
+        """The payload as an integer, CHECKSUM and COUNTER zero; signals left out keep their start value.
 
         Raises:
-            CodecError: an unknown signal, or a raw value that is neither in the signal's range nor one of its named codes.
+            CodecError: an unknown signal, or a value neither in the signal's range nor one of its named codes.
         """
         word = self._initial
         for name, value in values.items():
@@ -120,7 +121,7 @@ class MessageCodec:
         word = int.from_bytes(data, "little")
         values = {name: ((word >> shift & mask) ^ sign) - sign for name, shift, mask, sign, _, _, _ in self._common}
         if self.selector is not None:
-            for name, shift, mask, sign, _, _, _ in self._pages.get(values[self.selector], ()):
+            for name, shift, mask, sign, _, _, _ in self.pages.get(values[self.selector], ()):
                 values[name] = ((word >> shift & mask) ^ sign) - sign
         return values
 
@@ -164,7 +165,7 @@ def choice(message_name: str, signal_name: str, label: str) -> int:
 
 
 def protect(codec: MessageCodec, word: int, counter: int) -> bytes:
-    """Payload bytes with COUNTER and CHECKSUM set (AUTOSAR E2E Profile 2), or as they are for an unprotected message."""
+    """Payload bytes with COUNTER and CHECKSUM set (AUTOSAR E2E Profile 2), as they are if unprotected."""
     if codec.data_ids is None:
         return word.to_bytes(codec.length, "little")
     data = bytearray((word | counter << 8).to_bytes(codec.length, "little"))
@@ -225,8 +226,8 @@ MAX_LOST = 2
 class Receiver:
     """Checks and decodes the frames a node subscribes to; counts what it refuses.
 
-    It judges frames one by one: sender, CRC, length, counter. Whether a message as a whole is alive (timeouts, windows of
-    good and bad checks) is the business of the node.
+    It judges frames one by one: sender, CRC, length, counter. Whether a message as a whole is alive (timeouts,
+    windows of good and bad checks) is the business of the node.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -235,7 +236,16 @@ class Receiver:
         self.crc_errors = 0
         self.malformed = 0
         self.sequence_errors = 0
-        self.lost = 0
+        self._lost = dict.fromkeys(self._codecs, 0)
+
+    @property
+    def lost(self) -> int:
+        """Frames missing by their counters, of all messages; a gap of 16 looks like none."""
+        return sum(self._lost.values())
+
+    def lost_of(self, name: str) -> int:
+        """Frames of one message missing by its counter."""
+        return self._lost[message(name).can_id]
 
     def reset(self) -> None:
         """Forget the counters of all messages, as after a boot; what was counted so far stays."""
@@ -263,7 +273,7 @@ class Receiver:
         self._last[can_id] = counter
         if step == 1:
             return Received(Check.OK, codec.name, codec.unpack(data), 0)
-        self.lost += step - 1
+        self._lost[can_id] += step - 1
         if step - 1 > MAX_LOST:
             self.sequence_errors += 1
             return Received(Check.WRONG_SEQUENCE, codec.name, {}, step - 1)

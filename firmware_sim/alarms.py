@@ -1,0 +1,113 @@
+"""Alarms: one frame per change of state, repeated every step until the user has confirmed it."""
+
+import enum
+from dataclasses import dataclass
+
+from can_bus.lockstep import Turn
+
+
+class Code(enum.IntEnum):
+    """CTRL_Alarm.CtrlAlarmCode."""
+
+    CGM_LOST = 1
+    CGM_IMPLAUSIBLE = 2
+    PUMP_LOST = 3
+    DELIVERY_UNCERTAIN = 4
+    DOSE_LIMITED = 10
+    DOSE_REJECTED = 11
+    E2E_FAULT = 12
+    SELF_TEST = 14
+    NODE_RESET = 18
+
+
+class State(enum.IntEnum):
+    """CTRL_Alarm.CtrlAlarmState, after the annunciations of the Bluetooth Insulin Delivery Service."""
+
+    INACTIVE = 0
+    PENDING = 1
+    CONFIRMED = 2
+    SNOOZED = 3
+
+
+class Priority(enum.IntEnum):
+    """CTRL_Alarm.CtrlAlarmPriority, named after IEC 60601-1-8."""
+
+    INFO = 0
+    LOW = 1
+    MEDIUM = 2
+    HIGH = 3
+
+
+PRIORITY = {
+    Code.CGM_LOST: Priority.MEDIUM,
+    Code.CGM_IMPLAUSIBLE: Priority.MEDIUM,
+    Code.PUMP_LOST: Priority.HIGH,
+    Code.DELIVERY_UNCERTAIN: Priority.HIGH,
+    Code.DOSE_LIMITED: Priority.LOW,
+    Code.DOSE_REJECTED: Priority.LOW,
+    Code.E2E_FAULT: Priority.MEDIUM,
+    Code.SELF_TEST: Priority.HIGH,
+    Code.NODE_RESET: Priority.INFO,
+}
+
+INSTANCES = 65535
+"""Instance numbers run from 0 to 65534; 65535 is SNA."""
+
+
+@dataclass
+class _Alarm:
+    instance: int
+    state: State
+    aux: int
+    changed: bool = True
+
+
+class Alarms:
+    """The alarms in force, by code: at most one of each."""
+
+    def __init__(self) -> None:
+        self._active: dict[Code, _Alarm] = {}
+        self._next_instance = 0
+
+    def active(self, code: Code) -> bool:
+        """Whether the cause of this alarm still holds, confirmed or not."""
+        return code in self._active
+
+    def hold(self, code: Code, cause: bool, aux: int) -> None:
+        """Raise the alarm if its cause holds, end it if not; `aux` (16 bit) tells more and may change."""
+        alarm = self._active.get(code)
+        if cause and alarm is None:
+            self._active[code] = _Alarm(self._next_instance, State.PENDING, aux & 0xFFFF)
+            self._next_instance = (self._next_instance + 1) % INSTANCES
+        elif cause and alarm is not None:
+            alarm.aux = aux & 0xFFFF
+        elif alarm is not None and alarm.state != State.INACTIVE:
+            alarm.state = State.INACTIVE
+            alarm.changed = True
+
+    def acknowledge(self, instance: int, *, confirm: bool) -> bool:
+        """The user confirms or snoozes one instance; the cause stays. False if there is no such alarm."""
+        for alarm in self._active.values():
+            if alarm.instance == instance and alarm.state in (State.PENDING, State.SNOOZED):
+                alarm.state = State.CONFIRMED if confirm else State.SNOOZED
+                alarm.changed = True
+                return True
+        return False
+
+    def report(self, turn: Turn) -> None:
+        """Send what changed and what is pending, highest priority first; forget what has ended."""
+        order = sorted(self._active, key=lambda code: (-PRIORITY[code], self._active[code].instance))
+        for code in order:
+            alarm = self._active[code]
+            if alarm.changed or alarm.state == State.PENDING:
+                turn.send(
+                    "CTRL_Alarm",
+                    CtrlAlarmState=alarm.state,
+                    CtrlAlarmPriority=PRIORITY[code],
+                    CtrlAlarmCode=code,
+                    CtrlAlarmInstance=alarm.instance,
+                    CtrlAlarmAux=alarm.aux,
+                )
+                alarm.changed = False
+            if alarm.state == State.INACTIVE:
+                del self._active[code]

@@ -1,0 +1,107 @@
+"""The calibration of one patient: flashed parameter by parameter, checked as a set, active as a whole."""
+
+import binascii
+
+from can_bus import codec
+
+from .control import layout
+from .control.fixed import Ints
+
+SET_CRC_INDEX = 63
+
+CORE = {
+    "BASAL": "CfgBasal",
+    "TARGET": "CfgGlucoseTarget",
+    "MAX_BASAL": "CfgMaxBasal",
+    "PRAM_RATIO": "CfgPramRatio",
+    "MEAL_GAIN": "CfgMealGain",
+    "INSULIN_GAIN": "CfgInsulinGain",
+    "OBSERVER_GAIN": "CfgObserverGain",
+    "LEAD1_B0": "CfgLead1B0",
+    "LEAD1_B1": "CfgLead1B1",
+    "LEAD2_B0": "CfgLead2B0",
+    "LEAD2_B1": "CfgLead2B1",
+    "LEAD_A1": "CfgLeadA1",
+    "INSULIN_A11": "CfgInsulinA11",
+    "INSULIN_A21": "CfgInsulinA21",
+    "INSULIN_A22": "CfgInsulinA22",
+    "INSULIN_A31": "CfgInsulinA31",
+    "INSULIN_A32": "CfgInsulinA32",
+    "INSULIN_A33": "CfgInsulinA33",
+    "INSULIN_B1": "CfgInsulinB1",
+    "INSULIN_B2": "CfgInsulinB2",
+    "INSULIN_B3": "CfgInsulinB3",
+}
+"""Which CFG_Param signal feeds which word of the control core's parameters."""
+
+UNSET_IS_ZERO = ("CfgMaxBasal", "CfgPramRatio")
+"""Limits and options that count as 0 when not flashed, never as unlimited (requirement LIM-04)."""
+
+LOWEST = {"CfgBasal": 1, "CfgGlucoseTarget": 600, "CfgMealGain": 10000, "CfgInsulinGain": 10000}
+"""Raw values below which a parameter is refused as implausible (project's choice)."""
+
+
+def set_crc(values: dict[int, int]) -> int:
+    """CRC-16/CCITT-FALSE over index (1 byte) and raw value (4 bytes, little endian, signed) in order of index."""
+    data = bytearray()
+    for index in sorted(values):
+        data.append(index)
+        data += (values[index] & 0xFFFFFFFF).to_bytes(4, "little")
+    return binascii.crc_hqx(bytes(data), 0xFFFF)
+
+
+def parameter_names() -> dict[int, str]:
+    """CfgIndex -> signal name, from the DBC."""
+    message = codec.message("CFG_Param")
+    return {index: fields[0].name for index, fields in message.pages.items()}
+
+
+class Calibration:
+    """What was flashed so far, and what is in force."""
+
+    def __init__(self) -> None:
+        self._names = parameter_names()
+        self._fields = codec.message("CFG_Param").fields
+        self._received: dict[int, int] = {}
+        self._active: dict[str, int] = {}
+        self.parameters: Ints = [0] * len(layout.PARAMETERS)
+
+    @property
+    def active(self) -> bool:
+        """Whether a complete, checked set is in force."""
+        return bool(self._active)
+
+    def store(self, values: dict[str, int]) -> dict[str, int]:
+        """Take one decoded CFG_Param and return the raw values of its CFG_ParamEcho.
+
+        A value out of range is refused, not clipped: the echo shows what stays in force.
+        """
+        index = values["CfgIndex"]
+        name = self._names.get(index)
+        if index == SET_CRC_INDEX and name is not None:
+            if set_crc(self._received) == values[name]:
+                self._activate()
+            stored = set_crc(self._received) if self.active else 0
+        elif name is None:
+            stored = 0
+        else:
+            field = self._fields[name]
+            if max(field.low, LOWEST.get(name, field.low)) <= values[name] <= field.high:
+                self._received[index] = values[name]
+            stored = self._received.get(index, 0)
+        return {
+            "EchoIndex": index,
+            "EchoRaw": stored & 0x3FFFFFFF,
+            "EchoSetCrc": set_crc(self._received),
+        }
+
+    def _activate(self) -> None:
+        values = {self._names[index]: raw for index, raw in self._received.items()}
+        parameters = []
+        for word in layout.PARAMETERS:
+            name = CORE[word.name]
+            if name not in values and name not in UNSET_IS_ZERO:
+                return
+            parameters.append(values.get(name, 0))
+        self.parameters = parameters
+        self._active = values

@@ -1,0 +1,99 @@
+"""The CGM as the firmware sees it: which sample may be dosed on, and how old the newest one is."""
+
+from dataclasses import dataclass
+
+STATE_OK, STATE_BELOW_RANGE, STATE_ABOVE_RANGE = 1, 4, 5
+"""CGM_Reading.CgmState of the usable kinds of sample."""
+
+GLUCOSE_LOW, GLUCOSE_HIGH = 200, 8000
+"""0.1 mg/dL: what a sensor in state Ok may say (project's choice, requirement SEN-04)."""
+
+BELOW_RANGE_ACTS_AS, ABOVE_RANGE_ACTS_AS = 400, 4000
+"""0.1 mg/dL (requirement SEN-05)."""
+
+AGE_USABLE = 3
+"""Steps: a sample older than this is not used at all (15 min; requirement SEN-01)."""
+
+SEQUENCE_MODULUS = 65535
+"""CgmSampleSeq runs from 0 to 65534; 65535 is SNA."""
+
+NEVER = 1 << 20
+"""Age of a sample that has not come yet."""
+
+SETTLING_SAMPLES = 3
+"""Samples in a row after a gap before trends are trusted again (requirement SEN-08)."""
+
+
+@dataclass
+class Verdict:
+    """What one step's samples came to."""
+
+    glucose: int = -1  # 0.1 mg/dL, -1 = nothing usable
+    refused: int = 0  # samples refused for what they say or when they were taken
+    repeated: int = 0  # samples refused as not newer than the last one
+    missing: int = 0  # sample numbers skipped
+
+
+class Cgm:
+    """Judges samples by state, range, number and time; keeps the age of the newest usable one."""
+
+    def __init__(self) -> None:
+        self._sequence: int | None = None
+        self._taken: int | None = None  # step of the newest usable sample
+        self.streak = 0  # steps in a row with a usable sample
+        self.since_gap = 0  # usable samples since the last gap longer than AGE_USABLE
+
+    def age(self, step: int) -> int:
+        """Steps since the newest usable sample was taken."""
+        return NEVER if self._taken is None else step - self._taken
+
+    @property
+    def sequence(self) -> int | None:
+        """CgmSampleSeq of the newest usable sample."""
+        return self._sequence
+
+    @property
+    def settling(self) -> bool:
+        """Whether trends must not be trusted yet."""
+        return self.since_gap < SETTLING_SAMPLES
+
+    def judge(self, samples: list[dict[str, int]], step: int) -> Verdict:
+        """Take the CGM_Reading frames that arrived for instant `step` (checked by E2E before)."""
+        verdict = Verdict()
+        gap = self.age(step) > AGE_USABLE + 1
+        for sample in samples:
+            glucose = self._glucose(sample)
+            age = (step - sample["CgmSampleStep"]) % 256
+            if glucose < 0 or age > AGE_USABLE:
+                verdict.refused += 1
+                continue
+            number = sample["CgmSampleSeq"]
+            if self._sequence is not None:
+                ahead = (number - self._sequence) % SEQUENCE_MODULUS
+                if not 0 < ahead < SEQUENCE_MODULUS // 2:
+                    verdict.repeated += 1
+                    continue
+                verdict.missing += ahead - 1
+            self._sequence = number
+            self._taken = step - age
+            verdict.glucose = glucose
+        if verdict.glucose < 0:
+            self.streak = 0
+        else:
+            self.streak += 1
+            self.since_gap = 1 if gap else min(self.since_gap + 1, SETTLING_SAMPLES)
+        return verdict
+
+    @staticmethod
+    def _glucose(sample: dict[str, int]) -> int:
+        state = sample["CgmState"]
+        glucose = sample["GlucoseConc"]
+        if sample["CgmSampleSeq"] >= SEQUENCE_MODULUS:
+            return -1
+        if state == STATE_BELOW_RANGE:
+            return BELOW_RANGE_ACTS_AS
+        if state == STATE_ABOVE_RANGE:
+            return ABOVE_RANGE_ACTS_AS
+        if state == STATE_OK and GLUCOSE_LOW <= glucose <= GLUCOSE_HIGH:
+            return glucose
+        return -1

@@ -1,0 +1,74 @@
+"""The fallback ladder Auto -> Degraded -> SafeBasal, with Suspended and DeliveryUncertain beside it.
+
+Down at once, up one rung per step and only after two usable samples in a row (requirements FAL-01 to FAL-05). The
+ladder decides how much the control law may do, never how much it doses.
+"""
+
+import enum
+
+AGE_DEGRADED = 4
+"""Steps: from this age of the newest usable CGM sample on, at most the schedule."""
+
+AGE_SAFE_BASAL = 7
+"""Steps: from this age on, exactly the schedule and no pramlintide."""
+
+SAMPLES_UP = 2
+
+PUMP_SILENT = 3
+"""Steps without a status or totals of the pump (more than 11 min) after which delivery is uncertain."""
+
+
+class State(enum.IntEnum):
+    """CTRL_Status.CtrlState."""
+
+    INIT = 0
+    AUTO = 1
+    DEGRADED = 2
+    SAFE_BASAL = 3
+    SUSPENDED = 4
+    FAULT = 5
+    DELIVERY_UNCERTAIN = 6
+
+
+class Ladder:
+    """Where the firmware stands on the ladder."""
+
+    def __init__(self) -> None:
+        self.state = State.INIT
+        self._rung = State.SAFE_BASAL  # what the CGM alone allows, remembered under Suspended and the like
+
+    def update(self, *, calibrated: bool, suspended: bool, age: int, streak: int, pump_age: int) -> State:
+        """One step.
+
+        Args:
+            calibrated: a complete, checked calibration is active.
+            suspended: the user has suspended delivery.
+            age: steps since the newest usable CGM sample was taken.
+            streak: steps in a row with a usable sample, this one included.
+            pump_age: steps since the pump's status and totals were both heard.
+        """
+        self._rung = self._next_rung(age, streak)
+        if not calibrated:
+            self.state = State.INIT
+        elif suspended:
+            self.state = State.SUSPENDED
+        elif pump_age >= PUMP_SILENT:
+            self.state = State.DELIVERY_UNCERTAIN
+        elif self.state == State.INIT and streak < SAMPLES_UP and age < AGE_SAFE_BASAL:
+            self.state = State.INIT
+        elif self.state == State.INIT and streak >= SAMPLES_UP:
+            self._rung = State.AUTO  # the first samples of a run are not a way back up
+            self.state = State.AUTO
+        else:
+            self.state = self._rung
+        return self.state
+
+    def _next_rung(self, age: int, streak: int) -> State:
+        if age >= AGE_SAFE_BASAL:
+            return State.SAFE_BASAL
+        floor = State.DEGRADED if age >= AGE_DEGRADED else State.AUTO
+        if floor >= self._rung:
+            return floor
+        if streak >= SAMPLES_UP:
+            return State(self._rung - 1)
+        return self._rung

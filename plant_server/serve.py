@@ -1,0 +1,71 @@
+"""The plant on a real bus: waits for frames by the wall clock, and says who is missing when nothing comes."""
+
+import time
+from collections.abc import Callable
+
+from can_bus.link import Link
+
+from .server import PlantServer
+
+ROLL_CALL_EVERY = 0.1
+"""Seconds between two roll calls."""
+
+WATCH_EVERY = 0.25
+"""Seconds of silence after which the caller's `watch` is asked whether everybody is still alive."""
+
+
+class MemberSilent(RuntimeError):
+    """The device stopped answering; the text names the node and the step."""
+
+
+def serve(
+    plant: PlantServer,
+    link: Link,
+    *,
+    connect_timeout: float = 10.0,
+    step_timeout: float = 10.0,
+    watch: Callable[[], None] = lambda: None,
+    progress: Callable[[int], None] = lambda step: None,
+) -> None:
+    """Run the plant on a bus to the end of its run.
+
+    Args:
+        plant: a fresh plant.
+        link: the plant's bus.
+        connect_timeout: seconds of wall clock to wait for the first answer to the roll call.
+        step_timeout: seconds of wall clock to wait for SYNC_Done.
+        watch: called while waiting; raises when a process of the run has died.
+        progress: called with the step number now and then.
+
+    Raises:
+        MemberSilent: no answer in time.
+        PlantError: the device broke the protocol.
+        BusLost: the bus is gone or lost frames.
+    """
+    calling = True
+    deadline = time.monotonic() + connect_timeout
+    answer = plant.call_roll()
+    link.send(answer)
+    while not plant.finished:
+        frames = link.recv(ROLL_CALL_EVERY if calling else WATCH_EVERY)
+        answered = False
+        for frame in frames:
+            answer = list(plant.receive(frame))
+            if answer:
+                link.send(answer)
+                answered = True
+        if answered:
+            calling = False
+            deadline = time.monotonic() + step_timeout
+            if plant.step % 16 == 0:
+                progress(plant.step)
+        elif not plant.finished and not frames:
+            watch()
+            if time.monotonic() > deadline:
+                raise MemberSilent(_silence(plant, connect_timeout if calling else step_timeout))
+            if calling:
+                link.send(plant.call_roll())
+
+
+def _silence(plant: PlantServer, seconds: float) -> str:
+    return f"waited {seconds:g} s for {plant.waiting_for}: the firmware is not on this bus, hangs, or lost a frame"

@@ -1,0 +1,344 @@
+"""The plant as a node on the bus: patient, sensor, pump and user, and the keeper of simulated time.
+
+One object plays the nodes PLANT, CGM, PUMP and UI of the DBC, and TESTER while it flashes the calibration. It opens every
+sampling instant with what the device must know, gives it the turn, and integrates the patient over five minutes when the
+device says it is done. It never waits and never looks at a clock; `plant_server.serve` does.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+import dbc
+from can_bus import codec
+from can_bus.codec import Check, Receiver, Transmitter
+from can_bus.frame import Frame
+from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
+
+from . import mechanism, physiology
+from .physiology import Patient, Variability
+from .pump import Pump, PumpSettings
+from .scenario import EATING_MINUTES, Scenario
+from .sensor import STATE_OK, Sensor
+
+PMOL_PER_L_PER_MU_PER_L = 6.0
+"""The model's conversion of plasma insulin: 1 mU/L = 6 pmol/L (Dalla Man et al. 2007)."""
+
+RATE_UNKNOWN = -1024
+"""CGM_Reading.GlucoseRate SNA."""
+
+ALARM_PENDING = 1
+
+
+class PlantError(RuntimeError):
+    """The device broke the protocol or refused to run; the text says what it did and what was expected."""
+
+
+class Run(NamedTuple):
+    """What one run is made of."""
+
+    patient: Patient
+    scenario: Scenario
+    steps: int
+    seed: int
+    mode: int  # CtrlMode to ask for
+    calibration: Mapping[int, int]  # CfgIndex -> raw value, the CRC of the set last
+    sensor: str = "coloured"
+    variability: tuple[str, ...] = tuple(physiology.SOURCES)
+
+
+class PlantServer:
+    """The plant's side of the lockstep: see `can_bus.lockstep.Node`."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.finished = False
+        self.step = 0
+        self._phase = Phase.INIT
+        self._turns = 0
+        self._call = 0
+        self._roll = Transmitter()
+        self._transmitter = Transmitter()
+        self._receiver = Receiver(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
+        self._patient = _Body(run)
+        self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name)
+        self._last_glucose: float | None = None
+        self._pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
+        self._outbox: list[Frame] = []
+        self._echoes: dict[int, int] = {}
+        self._info: dict[str, int] | None = None
+        self._mode_seen: int | None = None
+
+    @property
+    def waiting_for(self) -> str:
+        """What the plant is waiting for, in words."""
+        what = {Phase.INIT: "the roll call", Phase.CONFIG: "the calibration", Phase.END: "the end of the run"}
+        return f"CTRL to answer {what.get(self._phase, f'step {self.step}')} with SYNC_Done"
+
+    # ---- turns
+
+    def call_roll(self) -> list[Frame]:
+        """The next roll call; to be repeated until `receive` has an answer."""
+        self._call += 1
+        major, minor = dbc.protocol_version()
+        return [
+            self._roll.frame("PLANT_Info", PlantProtocolMajor=major, PlantProtocolMinor=minor, PlantDbcCrc=dbc.crc32()),
+            self._roll.frame("SYNC_Step", SyncPhase=Phase.INIT, StepIndex=self._call, SimTime=0),
+        ]
+
+    def receive(self, frame: Frame) -> Sequence[Frame]:
+        """Take one frame of the device.
+
+        Raises:
+            PlantError: the device speaks another protocol version, refused the calibration or the mode, or asked for
+                more turns than any bolus needs.
+        """
+        check, name, values, _ = self._receiver.receive(frame)
+        if check > Check.OK_SOME_LOST:
+            return ()
+        if name == "PUMP_BasalCmd":
+            self._outbox += self._pump.command(values, self.step, self._transmitter)
+        elif name == "SYNC_Done":
+            return self._on_done(values)
+        elif name == "CTRL_Status":
+            self._mode_seen = values["CtrlMode"]
+        elif name == "CTRL_Alarm":
+            self._confirm(values)
+        elif name == "CFG_ParamEcho":
+            self._echoes[values["EchoIndex"]] = values["EchoRaw"]
+        elif name == "CTRL_Info":
+            self._info = values
+        return ()
+
+    def _on_done(self, values: dict[str, int]) -> list[Frame]:
+        expected = self._call if self._phase == Phase.INIT else self.step
+        if values["DoneStepIndex"] != expected:
+            return []
+        if self._phase == Phase.INIT:
+            self._check_version(values["DoneStatus"])
+            self._receiver.reset()
+            return self._configure()
+        if self._phase == Phase.CONFIG:
+            self._check_calibration()
+            return self._open_step()
+        if self._phase == Phase.END:
+            self.finished = True
+            return []
+        if values["DoneStatus"] == Done.CONTINUE:
+            return self._next_turn()
+        if self.step == 0 and self._mode_seen != self.run.mode:
+            raise PlantError(f"CTRL did not take up mode {_mode_name(self.run.mode)}: {self._mode_found()}")
+        self._advance()
+        return self._open_step()
+
+    def _check_version(self, status: int) -> None:
+        ours = dbc.protocol_version()
+        if self._info is None:
+            return  # a firmware that does not say; the calibration will tell
+        theirs = self._info["CtrlProtocolMajor"], self._info["CtrlProtocolMinor"]
+        if theirs[0] != ours[0] or status == Done.FAULT:
+            raise PlantError(
+                f"CTRL was built for protocol {theirs[0]}.{theirs[1]}, this bench speaks {ours[0]}.{ours[1]}: "
+                "rebuild the firmware with this bench's pumpbench.dbc"
+            )
+
+    def _configure(self) -> list[Frame]:
+        names = codec.message("CFG_Param").pages
+        frame = self._transmitter.frame
+        self._phase = Phase.CONFIG
+        return [
+            *(
+                frame("CFG_Param", CfgIndex=index, **{names[index][0].name: raw})
+                for index, raw in self.run.calibration.items()
+            ),
+            frame("MODE_Cmd", ModeRequest=self.run.mode, ModeCmdSeq=0, SuspendRequest=0),
+            frame("SYNC_Step", SyncPhase=Phase.CONFIG, StepIndex=0, SimTime=0),
+        ]
+
+    def _check_calibration(self) -> None:
+        names = codec.message("CFG_Param").pages
+        for index, raw in self.run.calibration.items():
+            sent = raw & 0x3FFFFFFF
+            if self._echoes.get(index) != sent:
+                found = self._echoes.get(index, "no echo")
+                raise PlantError(
+                    f"CTRL did not accept {names[index][0].name} (CfgIndex {index}): sent raw {sent}, echoed {found}"
+                )
+
+    def _mode_found(self) -> str:
+        return "no CTRL_Status came" if self._mode_seen is None else f"it reports {_mode_name(self._mode_seen)}"
+
+    def _next_turn(self) -> list[Frame]:
+        self._turns += 1
+        if self._turns > TURNS_PER_STEP:
+            raise PlantError(f"CTRL asked for more than {TURNS_PER_STEP} turns in step {self.step}")
+        frames = self._outbox
+        self._outbox = []
+        time = self.step * STEP_SECONDS + self._turns
+        frames.append(self._transmitter.frame("SYNC_Step", SyncPhase=Phase.CONTINUE, StepIndex=self.step, SimTime=time))
+        return frames
+
+    def _open_step(self) -> list[Frame]:
+        last = self.step == self.run.steps
+        self._phase = Phase.END if last else Phase.STEP
+        self._turns = 0
+        frame = self._transmitter.frame
+        frames = self._outbox
+        self._outbox = []
+        frames.append(self._read_sensor())
+        frames += self._pump.report(self.step, self._transmitter)
+        toggle = self.step & 1
+        frames.append(frame("HB_PUMP", NmtPump=5, TogglePump=toggle, ResetCausePump=0, BootPump=0))
+        frames.append(frame("HB_CGM", NmtCgm=5, ToggleCgm=toggle, ResetCauseCgm=0, BootCgm=0))
+        frames += self._tell_truth()
+        frames.append(frame("SYNC_Step", SyncPhase=self._phase, StepIndex=self.step, SimTime=self.step * STEP_SECONDS))
+        return frames
+
+    # ---- between two instants
+
+    def _advance(self) -> None:
+        insulin, pramlintide = self._pump.deliver(self.step)
+        for motor in (self._pump.insulin, self._pump.pramlintide):
+            if not mechanism.ledger_closes(motor):
+                raise PlantError(f"the pump's ledger does not close in step {self.step}: {motor.tolist()}")
+        self._patient.advance(self.step, insulin, pramlintide)
+        self.step += 1
+
+    def _read_sensor(self) -> Frame:
+        sample = self._sensor.sample(self.step, self._patient.interstitial)
+        rate = RATE_UNKNOWN
+        if self._last_glucose is not None:
+            rate = round((sample.glucose - self._last_glucose) / 5 * 100)
+            rate = min(max(rate, -1020), 1020)
+        self._last_glucose = sample.glucose if sample.state == STATE_OK else None
+        return self._transmitter.frame(
+            "CGM_Reading",
+            CgmState=sample.state,
+            GlucoseConc=round(sample.glucose * 10),
+            GlucoseRate=rate,
+            CgmSampleSeq=self.step % 65535,
+            CgmSampleStep=self.step % 256,
+        )
+
+    def _confirm(self, alarm: dict[str, int]) -> None:
+        """The user reads every alarm and confirms it."""
+        if alarm["CtrlAlarmState"] == ALARM_PENDING:
+            self._outbox.append(
+                self._transmitter.frame(
+                    "UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"]
+                )
+            )
+
+    def _tell_truth(self) -> list[Frame]:
+        body, pump = self._patient, self._pump
+        pages: list[dict[str, int]] = [
+            {
+                "TruthGlucose": _raw(body.glucose, 0.02),
+                "TruthInterstitial": _raw(body.interstitial, 0.02),
+            },
+            {
+                "TruthInsulin": _raw(body.plasma_insulin / PMOL_PER_L_PER_MU_PER_L, 0.02),
+                "TruthPramlintide": _raw(body.plasma_pramlintide, 0.02),
+            },
+            {"TruthEta": _raw(body.eta, 0.0001), "TruthQsto": _raw(body.q_sto, 4.0)},
+            {
+                "TruthRa": _raw(body.rate_of_appearance, 0.001),
+                "TruthMealCarbs": _raw(body.carbs_starting(self.step), 0.02),
+            },
+            _ledger("Insulin", pump.insulin),
+            _ledger("Pram", pump.pramlintide),
+        ]
+        return [
+            self._transmitter.frame("PLANT_Truth", TruthSel=page, TruthStep=self.step % 65536, **values)
+            for page, values in enumerate(pages)
+        ]
+
+
+def _raw(value: float, scale: float) -> int:
+    """A 16-bit raw value; what is beyond the range is shown at its end."""
+    return min(max(round(value / scale), 0), 65535)
+
+
+def _ledger(drug: str, motor: mechanism.Words) -> dict[str, int]:
+    return {
+        f"Truth{drug}Commanded": int(motor[mechanism.COMMANDED]) % 65536,
+        f"Truth{drug}Pending": min(int(motor[mechanism.PENDING]), 16383),
+        f"Truth{drug}Lost": int(motor[mechanism.LOST]) % 16384,
+    }
+
+
+def _mode_name(code: int) -> str:
+    choices = dbc.load().get_message_by_name("CTRL_Status").get_signal_by_name("CtrlMode").choices
+    return str(choices.get(code, code))
+
+
+class _Body:
+    """The patient between the pump and the sensor: what is eaten, how the body varies, where the state is."""
+
+    def __init__(self, run: Run) -> None:
+        self._nominal = run.patient.params
+        self._x = run.patient.x0.copy()
+        self._variability = Variability(run.seed, run.patient.name, run.variability)
+        self._p = self._variability.apply(self._nominal)
+        self._meals = run.scenario.meals_by_step()
+        self._carbs = self._eating_plan(run)
+        self._meal_index = 0
+
+    @staticmethod
+    def _eating_plan(run: Run) -> np.ndarray:
+        """Carbohydrate in mg eaten in every 30-s step of the run."""
+        plan = np.zeros((run.steps, mechanism.SUBSTEPS))
+        flat = plan.reshape(-1)
+        substeps = int(EATING_MINUTES / physiology.STEP_MIN)
+        for meal in run.scenario.meals:
+            start = meal.step * mechanism.SUBSTEPS
+            flat[start : start + substeps] += meal.carbs_g * 1000 / substeps
+        return plan
+
+    def carbs_starting(self, step: int) -> float:
+        """Carbohydrate (g) of the meals that start at this instant."""
+        return sum(meal.carbs_g for meal in self._meals.get(step, ()))
+
+    def advance(self, step: int, insulin: np.ndarray, pramlintide: np.ndarray) -> None:
+        """Integrate from instant `step` to the next one."""
+        for meal in self._meals.get(step, ()):
+            self._p = self._variability.apply(self._nominal, self._variability.meal(self._meal_index), out=self._p)
+            self._meal_index += 1
+            physiology.begin_meal(self._x, self._p, meal.carbs_g * 1000)
+        physiology.advance(self._x, self._p, float(step * STEP_SECONDS // 60), insulin, pramlintide, self._carbs[step])
+
+    @property
+    def glucose(self) -> float:
+        """mg/dL."""
+        return physiology.glucose(self._x, self._p)
+
+    @property
+    def interstitial(self) -> float:
+        """mg/dL."""
+        return physiology.interstitial(self._x, self._p)
+
+    @property
+    def plasma_insulin(self) -> float:
+        """pmol/L."""
+        return physiology.plasma_insulin(self._x, self._p)
+
+    @property
+    def plasma_pramlintide(self) -> float:
+        """pmol/L."""
+        return physiology.plasma_pramlintide(self._x, self._p)
+
+    @property
+    def eta(self) -> float:
+        """Attenuation of gastric emptying, 0 to 1."""
+        return physiology.eta(self._x, self._p)
+
+    @property
+    def q_sto(self) -> float:
+        """Carbohydrate in the stomach, mg."""
+        return physiology.q_sto(self._x, self._p)
+
+    @property
+    def rate_of_appearance(self) -> float:
+        """mg/kg/min."""
+        return physiology.rate_of_appearance(self._x, self._p)
