@@ -1,0 +1,421 @@
+"""Frames off the bus, put into simulated time.
+
+While a run is on, `Capture` only appends bytes. Afterwards `Capture.finish` reads the lockstep out of the frames
+themselves (SYNC_Step and SYNC_Done) and gives every frame its step, its turn and its time, so that a record depends on
+nothing but what was on the wire: not on the transport, and not on when a frame happened to be read.
+
+A frame that comes after a SYNC_Done belongs to the turn of the next token (the plant's batch precedes its token), one
+between a token and its SYNC_Done to that turn. The roll call before the first turn is repeated by the wall clock and is
+no part of the record.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from can_bus import codec
+from can_bus.frame import (
+    CAN_EFF_FLAG,
+    CAN_ERR_FLAG,
+    CAN_RTR_FLAG,
+    MAX_DATA,
+    Frame,
+    pack,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[Any]
+
+STEP_SECONDS: Final = 300
+"""Simulated seconds from one sampling instant to the next."""
+
+FRAME_MICROSECONDS: Final = 250
+"""Simulated time between two frames of a turn, about what a frame takes at 500 kbit/s."""
+
+_RECORD: Final = np.dtype([("can_id", "<u4"), ("length", "u1"), ("pad", "V3"), ("data", "u1", (MAX_DATA,))])
+_HASHED: Final = np.dtype([("channel", "u1"), ("step", "<u4"), ("can_id", "<u4"), ("length", "u1"), ("data", "V8")])
+
+
+@dataclass(frozen=True)
+class Frames:
+    """All frames of a run in canonical order: by step; within a step channel 0 in bus order, then channel 1.
+
+    Attributes:
+        channel: 0 = the device's bus, 1 = the plant's bus (only with a gateway between).
+        can_id: identifier with the flag bits of Linux (EFF, RTR, ERR).
+        length: number of data bytes.
+        data: (n, 8) bytes, zero beyond `length`.
+        step: sampling instant k the frame belongs to.
+        time_s: simulated seconds: SimTime of the turn's token plus 0.25 ms for each frame before it.
+        turn: -1 for the configuration before step 0, 0 for a step's first turn, then counting up.
+    """
+
+    channel: Array
+    can_id: Array
+    length: Array
+    data: Array
+    step: Array
+    time_s: Array
+    turn: Array
+
+    def __len__(self) -> int:
+        return len(self.can_id)
+
+    @property
+    def word(self) -> Array:
+        """The payloads as little-endian 64-bit integers."""
+        return np.ascontiguousarray(self.data).view("<u8").reshape(-1)
+
+    def select(self, rows: Array) -> Frames:
+        """The frames chosen by a mask or an array of positions, in that order."""
+        return Frames(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def frame(self, row: int) -> Frame:
+        """One frame as the bus carries it."""
+        return Frame(int(self.can_id[row]), self.data[row, : self.length[row]].tobytes())
+
+    def frames(self, channel: int = 0) -> list[Frame]:
+        """All frames of a channel as the bus carries them, in bus order."""
+        rows = np.flatnonzero(self.channel == channel)
+        ids, lengths, data = self.can_id[rows].tolist(), self.length[rows].tolist(), self.data[rows].tobytes()
+        return [
+            Frame(can_id, data[8 * row : 8 * row + length])
+            for row, (can_id, length) in enumerate(zip(ids, lengths, strict=True))
+        ]
+
+    def sha256(self) -> str:
+        """Hash over channel, step, id, length and data (padded with zeros) of all frames, packed as `<BIIB8s`."""
+        packed = np.zeros(len(self), _HASHED)
+        packed["channel"], packed["step"] = self.channel, self.step
+        packed["can_id"], packed["length"] = self.can_id, self.length
+        packed["data"] = np.ascontiguousarray(self.data).view("V8").reshape(-1)
+        return hashlib.sha256(packed.tobytes()).hexdigest()
+
+    @functools.cached_property
+    def intact(self) -> Array:
+        """Which frames a receiver may believe: an id of the DBC, its length, and an E2E checksum that fits."""
+        return _intact(self.can_id, self.length, self.data)
+
+
+class Capture:
+    """Collects the frames of a run as they come: bytes in, analysis afterwards."""
+
+    def __init__(self) -> None:
+        self._buffers: dict[int, bytearray] = {}
+
+    def __len__(self) -> int:
+        return sum(map(len, self._buffers.values())) // _RECORD.itemsize
+
+    def extend(self, channel: int, frames: Sequence[Frame]) -> None:
+        """Append frames in the order the bus showed them.
+
+        Args:
+            channel: 0 for the device's bus, 1 for the plant's bus when a gateway lies between.
+            frames: what arrived since the last call.
+
+        Raises:
+            ValueError: a frame has more than 8 data bytes.
+        """
+        self._buffers.setdefault(channel, bytearray()).extend(pack(frames))
+
+    def finish(self) -> Frames:
+        """Put all frames collected so far into simulated time and canonical order; more may be appended afterwards."""
+        return _canonical({channel: np.frombuffer(bytes(raw), _RECORD) for channel, raw in self._buffers.items()})
+
+
+# --------------------------------------------------------------------------------------------- what the frames say
+
+
+@functools.cache
+def _crc_table() -> Array:
+    table = np.zeros(256, "u1")
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x2F if crc & 0x80 else crc << 1) & 0xFF
+        table[byte] = crc
+    return table
+
+
+def _intact(can_id: Array, length: Array, data: Array) -> Array:
+    """Which frames have an id and a length of the DBC and, where protected, a fitting checksum (E2E Profile 2)."""
+    good = np.zeros(len(can_id), bool)
+    table = _crc_table()
+    for message in codec.messages().values():
+        rows = np.flatnonzero((can_id == message.can_id) & (length == message.length))
+        if not len(rows):
+            continue
+        if message.data_ids is None:
+            good[rows] = True
+            continue
+        payload = data[rows]
+        crc = np.full(len(rows), 0xFF, "u1")
+        for column in range(1, message.length):
+            crc = table[crc ^ payload[:, column]]
+        data_ids = np.frombuffer(message.data_ids, "u1")
+        crc = table[crc ^ data_ids[payload[:, 1] & 0xF]]
+        good[rows] = crc ^ 0xFF == payload[:, 0]
+    return good
+
+
+class _Token(NamedTuple):
+    """A SYNC_Step that opens a turn."""
+
+    row: int
+    phase: int
+    step: int
+    time_s: int
+
+
+@functools.cache
+def _phases() -> dict[str, int]:
+    return {
+        label: codec.choice("SYNC_Step", "SyncPhase", label) for label in ("Init", "Step", "Continue", "End", "Config")
+    }
+
+
+@functools.cache
+def _bench_ids() -> Array:
+    """Ids of the plant's side, which are silent while the device has the turn."""
+    names = ("PLANT", "CGM", "PUMP", "UI")
+    return np.array([message.can_id for message in codec.messages().values() if message.sender in names], "u4")
+
+
+def _signal(message: str, name: str, words: Array) -> list[int]:
+    field = codec.message(message).fields[name]
+    return [int(word) >> field.shift & field.mask for word in words]
+
+
+def _read_tokens(can_id: Array, good: Array, words: Array) -> list[_Token]:
+    rows = np.flatnonzero((can_id == codec.message("SYNC_Step").can_id) & good)
+    picked = words[rows]
+    return [
+        _Token(*fields)
+        for fields in zip(
+            rows.tolist(),
+            _signal("SYNC_Step", "SyncPhase", picked),
+            _signal("SYNC_Step", "StepIndex", picked),
+            _signal("SYNC_Step", "SimTime", picked),
+            strict=True,
+        )
+    ]
+
+
+def _without_roll_call(can_id: Array, good: Array, tokens: list[_Token], done: Array) -> Array:
+    """Mask of the frames after the roll call: after the answer to the last call before the first real turn."""
+    keep = np.ones(len(can_id), bool)
+    init = _phases()["Init"]
+    calls = 0
+    while calls < len(tokens) and tokens[calls].phase == init:
+        calls += 1
+    if calls == 0:
+        return keep
+    last = tokens[calls - 1].row
+    opening = tokens[calls].row if calls < len(tokens) else len(can_id)
+    answers = done[(done > last) & (done < opening)]
+    keep[: (answers[0] if len(answers) else last) + 1] = False
+    # answers to earlier calls that arrive late are no part of the record either
+    answer_ids = [codec.message(name).can_id for name in ("SYNC_Done", "CTRL_Info")]
+    keep[:opening] &= ~np.isin(can_id[:opening], answer_ids)
+    if calls == len(tokens):
+        keep[:] = False  # nothing but the roll call: there was no run
+    return keep
+
+
+def _turns(tokens: list[_Token], done: Array) -> list[_Token]:
+    """The tokens that open a turn: without repetitions, and without those an injected fault put out of order."""
+    turns: list[_Token] = []
+    config = _phases()["Config"]
+    first = next((token.step for token in tokens if token.phase != config), 0)
+    for index, read in enumerate(tokens):
+        token = read._replace(step=first, time_s=STEP_SECONDS * first) if read.phase == config else read
+        if turns:
+            current = turns[-1]
+            answered = np.searchsorted(done, token.row) > np.searchsorted(done, current.row)
+            if token[1:] == current[1:] and not answered:
+                continue
+            if token.step < current.step:
+                continue
+            if token.step > current.step + 1 and index + 1 < len(tokens) and tokens[index + 1].step < token.step:
+                continue
+        turns.append(token)
+    return turns
+
+
+def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Array, Array]:
+    """For one channel: which frames belong to the record, and their step, turn and time in microseconds."""
+    words = np.ascontiguousarray(data).view("<u8").reshape(-1)
+    good = _intact(can_id, length, data)
+    tokens = _read_tokens(can_id, good, words)
+    done = np.flatnonzero((can_id == codec.message("SYNC_Done").can_id) & good)
+    keep = _without_roll_call(can_id, good, tokens, done)
+    tokens = [token for token in tokens if keep[token.row]]
+    done = done[keep[done]]
+    turns = _turns(tokens, done)
+    count = len(can_id)
+    if not turns:
+        zeros = np.zeros(count, "i8")
+        return keep, zeros, zeros, np.arange(count) * FRAME_MICROSECONDS
+
+    starts = np.array([token.row for token in turns])
+    limits = np.append(starts[1:], count)
+    ends = limits - 1  # last row of each turn; without any SYNC_Done (free run) a frame belongs to the last token seen
+    if len(done):
+        first = np.searchsorted(done, starts)
+        for index, (start, limit) in enumerate(zip(starts, limits, strict=True)):
+            if first[index] < len(done) and done[first[index]] < limit:
+                ends[index] = done[first[index]]
+            else:  # unanswered: the next batch starts where the plant's side speaks again
+                others = np.flatnonzero(np.isin(can_id[start + 1 : limit], _bench_ids()))
+                if len(others):
+                    ends[index] = start + others[0]
+    rows = np.arange(count)
+    turn_of = np.searchsorted(ends, rows)  # the first turn that ends at or after the row
+    phases = _phases()
+    steps: list[int] = []
+    numbers: list[int] = []
+    bases: list[int] = []
+    base = 0
+    for token in turns:
+        if token.phase == phases["Config"] and not steps:
+            number = -1
+        else:
+            number = numbers[-1] + 1 if steps and steps[-1] == token.step else 0
+        inside = 0 <= token.time_s - STEP_SECONDS * token.step < STEP_SECONDS
+        base = max(base, token.time_s if inside else STEP_SECONDS * token.step + max(number, 0))
+        steps.append(token.step)
+        numbers.append(number)
+        bases.append(base)
+    # a batch whose token never came (the run was cut off), or what is said after the end
+    over = turns[-1].phase == phases["End"]
+    steps.append(steps[-1] if over else steps[-1] + 1)
+    numbers.append(numbers[-1] if over else 0)
+    bases.append(base if over else max(base, STEP_SECONDS * steps[-1]))
+    base_of = np.array(bases)[turn_of]
+    kept = np.flatnonzero(keep)
+    micros = np.zeros(count, "i8")
+    micros[kept] = _microseconds(base_of[kept])
+    return keep, np.array(steps)[turn_of], np.array(numbers)[turn_of], micros
+
+
+def _microseconds(base_s: Array) -> Array:
+    """Time of each frame: base plus 250 us per frame before it, closer only where that would reach the next base."""
+    values, firsts, counts = np.unique(base_s, return_index=True, return_counts=True)
+    spacing = np.full(len(values), FRAME_MICROSECONDS, "i8")
+    room = np.diff(values) * 1_000_000
+    spacing[:-1] = np.minimum(spacing[:-1], np.maximum(room // counts[:-1], 1))
+    group = np.repeat(np.arange(len(values)), counts)
+    micros: Array = base_s.astype("i8") * 1_000_000 + (np.arange(len(base_s)) - firsts[group]) * spacing[group]
+    return micros
+
+
+def _canonical(records: dict[int, Array]) -> Frames:
+    parts: list[tuple[Array, ...]] = []
+    for channel in sorted(records):
+        record = records[channel]
+        can_id, length = record["can_id"].astype("u4"), record["length"].astype("u1")
+        data = record["data"].reshape(-1, MAX_DATA) * (np.arange(MAX_DATA) < length[:, None]).astype("u1")
+        keep, step, turn, micros = _assign(can_id, length, data)
+        channels = np.full(int(keep.sum()), channel, "u1")
+        time_s = micros[keep] / 1e6
+        parts.append(
+            (channels, can_id[keep], length[keep], data[keep], step[keep].astype("i4"), time_s, turn[keep].astype("i2"))
+        )
+    if not parts:
+        empty = np.zeros(0)
+        kinds = ("u1", "u4", "u1", "u1", "i4", "f8", "i2")
+        columns = [empty.astype(kind) for kind in kinds]
+        columns[3] = np.zeros((0, MAX_DATA), "u1")
+        return Frames(*columns)
+    frames = Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return frames.select(np.lexsort((frames.channel, frames.step)))
+
+
+# ------------------------------------------------------------------------------------------------------ log files
+
+
+def write_candump(frames: Frames, path: Path, names: Sequence[str] = ("can0", "can1")) -> None:
+    """Write the frames as a candump log (`candump -L`), time-stamped with simulated seconds.
+
+    python-can, `cantools decode`, can-utils and SavvyCAN read it.
+
+    Args:
+        frames: what to write.
+        path: the file; overwritten.
+        names: interface name of channel 0 and of channel 1.
+    """
+    order = np.argsort(frames.time_s, kind="stable")
+    micros = np.rint(frames.time_s[order] * 1e6).astype("i8").tolist()
+    channels, ids = frames.channel[order].tolist(), frames.can_id[order].tolist()
+    lengths, data = frames.length[order].tolist(), frames.data[order].tobytes().hex().upper()
+    flags = CAN_EFF_FLAG | CAN_ERR_FLAG
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        for row, (micro, channel, can_id, length) in enumerate(zip(micros, channels, ids, lengths, strict=True)):
+            seconds, fraction = divmod(micro, 1_000_000)
+            if not can_id & (flags | CAN_RTR_FLAG):
+                text = f"{can_id:03X}#{data[16 * row : 16 * row + 2 * length]}"
+            else:
+                bare = can_id & ~CAN_RTR_FLAG
+                name = f"{bare if bare & CAN_ERR_FLAG else bare & ~CAN_EFF_FLAG:08X}" if bare & flags else f"{bare:03X}"
+                payload = f"R{length or ''}" if can_id & CAN_RTR_FLAG else data[16 * row : 16 * row + 2 * length]
+                text = f"{name}#{payload}"
+            file.write(f"({seconds}.{fraction:06d}) {names[channel]} {text}\n")
+
+
+def _parse_line(line: str) -> tuple[str, int, bytes]:
+    """Interface, id with flags and data of one line of a candump log.
+
+    Raises:
+        ValueError: the line is none.
+    """
+    stamp, name, frame, *direction = line.split()
+    if stamp[0] != "(" or stamp[-1] != ")" or direction not in ([], ["R"], ["T"]):
+        raise ValueError(line)
+    float(stamp[1:-1])
+    ident, _, payload = frame.partition("#")
+    can_id = int(ident, 16)
+    if len(ident) == 8 and not can_id & CAN_ERR_FLAG:
+        can_id |= CAN_EFF_FLAG
+    if payload[:1] in ("R", "r"):
+        return name, can_id | CAN_RTR_FLAG, bytes(int(payload[1:] or 0))
+    data = bytes.fromhex(payload)
+    if len(data) > MAX_DATA or can_id > 0xFFFFFFFF:
+        raise ValueError(line)
+    return name, can_id, data
+
+
+def read_candump(path: Path, names: Sequence[str] = ("can0", "can1")) -> Frames:
+    """Read a candump log back; step, turn and time come from the SYNC frames in it, not from its time stamps.
+
+    Args:
+        path: the log.
+        names: interface name of channel 0 and of channel 1; other interfaces are numbered in the order of their names.
+
+    Raises:
+        ValueError: a line is no frame of classic CAN; the text says which.
+        OSError: the file cannot be read.
+    """
+    found: dict[str, list[Frame]] = {}
+    with path.open(encoding="ascii", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if not line.strip():
+                continue
+            try:
+                name, can_id, data = _parse_line(line)
+            except (ValueError, IndexError):
+                raise ValueError(f"{path}:{number}: not a line of a candump log: {line.strip()[:60]!r}") from None
+            found.setdefault(name, []).append(Frame(can_id, data))
+    capture = Capture()
+    channels = list(names) if set(found) <= set(names) else sorted(found)
+    for name, frames in found.items():
+        capture.extend(channels.index(name), frames)
+    return capture.finish()
