@@ -5,13 +5,14 @@ from .glucose import glucose, interstitial
 from .insulin import plasma_insulin
 from .integrate import STEP_MIN, advance
 from .parameters import PARAMETERS, Parameter
-from .patients import Patient, PatientError, cohort, load_patient, pramlintide_sets
+from .patients import PHYSIOLOGIES, Patient, PatientError, cohort, load_patient, pramlintide_sets
 from .pramlintide import eta, plasma_pramlintide
 from .states import STATES, State
 from .variability import SOURCES, MealFactors, Variability
 
 __all__ = [
     "PARAMETERS",
+    "PHYSIOLOGIES",
     "SOURCES",
     "STATES",
     "STEP_MIN",

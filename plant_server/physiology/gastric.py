@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0917 - compiled functions take numbers by position
 """Meal: stomach, intestine, and the glucose that appears in plasma.
 
 Dalla Man 2006 with the pramlintide effect of Pons Torres 2025 (meal model with the factor η). η slows the
@@ -29,6 +28,18 @@ def k_empt(q_sto: float, meal: float, k_max: float, k_min: float, b: float, c: f
     return k_min + (k_max - k_min) * (1.0 - slowing + recovery)
 
 
+#: mg; the small-meal rule treats a meal below this size as one of this size, else its rate would know no bound
+SMALLEST_MEAL = 1000.0
+
+
+@compiled
+def small_meal_factor(meal: float, limit: float) -> float:
+    """Emptying of meals below `limit` mg is limit/D times faster (T1DMS, undocumented; LoopInsighT1, MIT)."""
+    if meal <= 0.0 or meal >= limit:
+        return 1.0
+    return limit / max(meal, SMALLEST_MEAL)
+
+
 @compiled
 def gastric_derivatives(x: Array, p: Array, eating: float, eta: float, dx: Array) -> float:
     """Write Qsto1', Qsto2', Qgut' (mg/min) and return the rate of appearance Ra (mg/kg/min).
@@ -39,8 +50,11 @@ def gastric_derivatives(x: Array, p: Array, eating: float, eta: float, dx: Array
     q_sto2 = x[st.Q_STO2]
     q_gut = x[st.Q_GUT]
 
+    meal = x[st.D]
+    k = k_empt(q_sto1 + q_sto2, meal, p[par.K_MAX], p[par.K_MIN], p[par.B], p[par.C])
+
     grinding = p[par.K_MAX] * q_sto1
-    emptying = eta * k_empt(q_sto1 + q_sto2, x[st.D], p[par.K_MAX], p[par.K_MIN], p[par.B], p[par.C]) * q_sto2
+    emptying = eta * k * small_meal_factor(meal, p[par.SMALL_MEAL]) * q_sto2
     absorption = p[par.K_ABS] * q_gut
 
     dx[st.Q_STO1] = eating - grinding

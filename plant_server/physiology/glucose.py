@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0917 - compiled functions take numbers by position
 """Glucose: production, utilisation, excretion, interstitial fluid (Dalla Man 2007; simglucose, MIT)."""
 
 from . import parameters as par
@@ -34,9 +33,7 @@ def glucose_derivatives(
     gp = x[st.GP]
     gt = x[st.GT]
 
-    production = max(
-        0.0, p[par.KP1] - p[par.KP2] * gp - circadian * p[par.KP3] * x[st.XL] + glucagon_production
-    )
+    production = max(0.0, p[par.KP1] - p[par.KP2] * gp - circadian * p[par.KP3] * x[st.XL] + glucagon_production)
     excretion = p[par.KE1] * max(0.0, gp - p[par.KE2])
     uptake_independent = insulin_independent_uptake(gp, p[par.FSNC], p[par.VG])
     uptake = (p[par.VM0] + circadian * p[par.VMX] * x[st.X] * risk_gain) * gt / (p[par.KM0] + gt)

@@ -13,13 +13,11 @@ Putting the first two into the third leaves a quadratic in Gt.
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from . import parameters as par
 from . import states as st
+from .compiled import Array
 from .insulin import PMOL_PER_U
-
-Array = npt.NDArray[np.float64]
 
 
 class NoSteadyStateError(ValueError):
@@ -49,6 +47,11 @@ def operating_point(p: Array, basal_glucose: float) -> tuple[Array, float]:
     x[st.X] = insulin - p[par.IB]
     x[st.I1] = insulin
     x[st.XL] = insulin
+    if p[par.S2013] != 0.0:
+        # insulin is at Ith; above Gth glucagon secretion rests below its basal rate
+        static = p[par.KGSRS] * (p[par.GTH] - basal_glucose) + p[par.K01G] * p[par.HB]
+        x[st.SRHS] = max(0.0, static)
+        x[st.H] = x[st.SRHS] / p[par.K01G]
     infusion = (p[par.M2] + p[par.M4]) * x[st.IP] - p[par.M1] * x[st.IL]  # pmol/kg/min
     x[st.ISC1] = infusion / (p[par.KA1] + p[par.KD])
     x[st.ISC2] = p[par.KD] * x[st.ISC1] / p[par.KA2]

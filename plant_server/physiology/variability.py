@@ -10,11 +10,9 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from . import parameters as par
-
-Array = npt.NDArray[np.float64]
+from .compiled import Array
 
 
 class MealFactors(NamedTuple):
