@@ -4,10 +4,11 @@ import csv
 import functools
 import io
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from can_bus import yaml_file
 
 DIRECTORY = Path(__file__).with_name("scenarios")
 
@@ -109,16 +110,10 @@ def _read(path: Path) -> str:
 
 
 def _from_yaml(path: Path) -> Scenario:
-    text = _read(path)
     try:
-        content: Any = yaml.safe_load(text)
-        parsed = ScenarioFile.model_validate(content)
-    except yaml.YAMLError as error:
-        raise ScenarioError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ScenarioError(f"{path}: {place}: {first['msg']} (found {first['input']!r})") from error
+        parsed = yaml_file.load(path, ScenarioFile)
+    except yaml_file.FileError as error:
+        raise ScenarioError(str(error)) from error
     return _scenario(path.stem, parsed.meals, parsed.days)
 
 

@@ -1,0 +1,129 @@
+"""The gateway between the device's bus and the plant's: where frames are lost, late or forged on purpose.
+
+It is a wire with faults: what arrives on one side goes out on the other in the same order, except for what a fault does
+to it. Every injection is itself a frame, FAULT_Inject, on the bus the faulty frame was headed for.
+
+Simulated time is read off the lockstep: what the plant sends after SYNC_Done(k) belongs to instant k+1, although the
+token of that instant comes last. On a device that does not do lockstep, the newest SYNC_Step tells the time.
+"""
+
+import argparse
+import enum
+import select
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import can
+
+from can_bus import codec, yaml_file
+from can_bus.codec import CodecError
+from can_bus.faults import Fault, Injector, load_faults
+from can_bus.frame import Frame
+from can_bus.hub import Hub
+from can_bus.link import BusLost, Link
+from can_bus.lockstep import STEP_SECONDS, Done, Phase
+from can_bus.url import BusUrlError, open_link
+
+
+class Side(enum.IntEnum):
+    """The two ends of the gateway; also the channel numbers of a recording."""
+
+    DEVICE = 0
+    PLANT = 1
+
+
+class Clock:
+    """Simulated time as the frames tell it."""
+
+    def __init__(self) -> None:
+        self.time = 0
+        self._step_message = codec.message("SYNC_Step")
+        self._done_message = codec.message("SYNC_Done")
+        self._phase = Phase.INIT
+
+    def watch(self, frame: Frame) -> None:
+        """Look at a frame in passing."""
+        if frame.can_id == self._step_message.can_id and len(frame.data) == self._step_message.length:
+            values = self._step_message.unpack(frame.data)
+            self._phase = Phase(values["SyncPhase"]) if values["SyncPhase"] in set(Phase) else Phase.STEP
+            if self._phase == Phase.STEP:
+                self.time = values["StepIndex"] * STEP_SECONDS
+        elif frame.can_id == self._done_message.can_id and len(frame.data) == self._done_message.length:
+            values = self._done_message.unpack(frame.data)
+            if self._phase in (Phase.STEP, Phase.CONTINUE) and values["DoneStatus"] != Done.CONTINUE:
+                self.time = (values["DoneStepIndex"] + 1) * STEP_SECONDS
+
+
+class Gateway:
+    """The gateway without its buses: a frame in, what goes out on the other side."""
+
+    def __init__(self, faults: tuple[Fault, ...] = ()) -> None:
+        self._injector = Injector(faults)
+        self._clock = Clock()
+        self.finished = False
+        self._step_id = codec.message("SYNC_Step").can_id
+        self._done_id = codec.message("SYNC_Done").can_id
+        self._ending = False
+
+    def forward(self, frame: Frame) -> list[Frame]:
+        """What the other side gets for this frame."""
+        passed, reports = self._injector.apply(frame, self._clock.time)
+        self._clock.watch(frame)
+        if frame.can_id == self._step_id and len(frame.data) == 8:
+            self._ending = codec.message("SYNC_Step").unpack(frame.data)["SyncPhase"] == Phase.END
+        elif frame.can_id == self._done_id and self._ending:
+            self.finished = True
+        return reports + passed
+
+
+def serve(gateway: Gateway, device: Link, plant: Link) -> None:
+    """Join two buses until the run ends.
+
+    Raises:
+        BusLost: one of the buses is gone or lost frames.
+    """
+    other = {device.fileno(): (device, plant), plant.fileno(): (plant, device)}
+    while not gateway.finished:
+        ready, _, _ = select.select(list(other), [], [])
+        for descriptor in ready:
+            source, sink = other[descriptor]
+            frames = source.recv(0)
+            out = [forwarded for frame in frames for forwarded in gateway.forward(frame)]
+            if out:
+                sink.send(out)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; exit status 0 the run ended, 2 wrong usage or fault file, 3 a bus was lost."""
+    parser = argparse.ArgumentParser(prog="python -m can_bus.gateway", description=__doc__)
+    parser.add_argument("--plant", required=True, metavar="URL", help="the plant's bus")
+    parser.add_argument("--device", required=True, metavar="URL", help="the device's bus")
+    parser.add_argument("--host", action="store_true", help="serve the device's bus as a hub, from this process")
+    parser.add_argument("--faults", type=Path, metavar="FILE", help="YAML file of faults")
+    options = parser.parse_args(arguments)
+    try:
+        faults = load_faults(options.faults) if options.faults else ()
+        gateway = Gateway(faults)
+        with open_link(options.plant) as plant:
+            if options.host:
+                with Hub(options.device) as hub, hub.local_link() as device:
+                    print("ready", flush=True)
+                    serve(gateway, device, plant)
+            else:
+                with open_link(options.device) as device:
+                    print("ready", flush=True)
+                    serve(gateway, device, plant)
+    except (BusUrlError, CodecError, yaml_file.FileError) as error:
+        print(f"gateway: {error}", file=sys.stderr)
+        return 2
+    except (BusLost, can.CanError, OSError) as error:
+        print(f"gateway: {error}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
