@@ -1,8 +1,8 @@
 """The plant as a node on the bus: patient, sensor, pump and user, and the keeper of simulated time.
 
-One object plays the nodes PLANT, CGM, PUMP and UI of the DBC, and TESTER while it flashes the calibration. It opens every
-sampling instant with what the device must know, gives it the turn, and integrates the patient over five minutes when the
-device says it is done. It never waits and never looks at a clock; `plant_server.serve` does.
+One object plays the nodes PLANT, CGM, PUMP and UI of the DBC, and TESTER while it flashes the calibration. It opens
+every sampling instant with what the device must know, gives it the turn, and integrates the patient over five minutes
+when the device says it is done. It never waits and never looks at a clock; `plant_server.serve` does.
 """
 
 from collections.abc import Mapping, Sequence

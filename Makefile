@@ -1,0 +1,37 @@
+# Two commands do all the set-up on a fresh machine: `make run` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test lint docs benchmark clean
+
+help:            ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
+
+setup: $(STAMP)  ## create .venv and install everything into it
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "pumpbench needs Python 3.11 or newer; this is %s (set PYTHON=...)" % sys.version.split()[0])'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+run: setup       ## one closed-loop day over the embedded bus, with a recording
+	$(BIN)/pumpbench run
+
+test: setup      ## linters, then all tests: on the embedded bus here, on a real vcan through tools/with_vcan
+	tools/run_tests
+
+lint: setup      ## ruff, mypy, import-linter, generated files up to date
+	tools/run_lint
+
+docs: setup      ## regenerate the generated pages of docs/
+	$(BIN)/python -m tools.generate_docs
+
+benchmark: setup ## the speed figures, each beside its ceiling
+	$(BIN)/pumpbench benchmark
+
+clean:           ## remove what was built, runs/ too
+	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,5 @@
+"""`python -m pumpbench`."""
+
+from pumpbench.cli import main
+
+main()

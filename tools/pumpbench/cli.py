@@ -1,0 +1,285 @@
+"""The command line. Commands import what they need when they run, so that --help is quick."""
+
+import signal
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from pumpbench import __version__
+
+EXIT_WRONG, EXIT_USAGE, EXIT_DEAD, EXIT_INTERRUPTED = 1, 2, 3, 130
+
+app = typer.Typer(
+    name="pumpbench",
+    help="A hardware-in-the-loop bench for insulin + pramlintide pump firmware. Research only, not a medical device.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class Strategy(StrEnum):
+    """The modes of the paper this build knows."""
+
+    NMA = "nma"
+    S2 = "s2"
+
+
+class Failed(Exception):
+    """A command has failed with this exit status; the text is the one line the user gets."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        console.print(f"pumpbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    patient: Annotated[str, typer.Option(help="One name, a comma list, or all; or file.csv#name.")] = "adult#001",
+    strategy: Annotated[Strategy, typer.Option(help="Mode of the controller.")] = Strategy.S2,
+    scenario: Annotated[str, typer.Option(help="validation-14d, fasting, or a YAML or CSV file.")] = "validation-14d",
+    days: Annotated[float, typer.Option(help="Simulated days; rounded to steps of 5 min.", min=0.0)] = 1.0,
+    seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 1,
+    bus: Annotated[
+        str,
+        typer.Option(
+            help="hub, inproc, unix:/path, tcp:127.0.0.1:port, socketcan:vcan0, slcan:/dev/ttyACM0@500000, "
+            "or any python-can interface:channel."
+        ),
+    ] = "hub",
+    device_bus: Annotated[
+        str | None, typer.Option(help="With --faults on a real bus: the device's side (default: vcan1 beside vcan0).")
+    ] = None,
+    faults: Annotated[Path | None, typer.Option(help="YAML file of faults, acting between device and plant.")] = None,
+    firmware: Annotated[
+        str | None, typer.Option(help='Command that starts another firmware; "{bus}" becomes the bus URL.')
+    ] = None,
+    sensor: Annotated[str, typer.Option(help="coloured, breton or ideal.")] = "coloured",
+    out: Annotated[Path | None, typer.Option(help="Run folder to write (default: below runs/).")] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing run folder at --out.")] = False,
+    connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware's first answer.")] = 20.0,
+    step_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware in a step.")] = 10.0,
+) -> None:
+    """Run the closed loop: patient, firmware and recorder on one bus. Exit status 1 if a hazard was counted."""
+    from pumpbench import rig  # noqa: PLC0415
+
+    names = _patients(patient)
+    requests = [
+        rig.Request(
+            patient=name,
+            out=_run_folder(out, name, len(names) > 1, f"{strategy}-{scenario}-{days:g}d-seed{seed}"),
+            strategy=strategy,
+            scenario=scenario,
+            steps=round(days * rig.STEPS_PER_DAY),
+            seed=seed,
+            bus=bus,
+            device_bus=device_bus,
+            faults=faults,
+            firmware=firmware,
+            sensor=sensor,
+            overwrite=overwrite or out is None,
+            connect_timeout=connect_timeout,
+            step_timeout=step_timeout,
+        )
+        for name in names
+    ]
+    prepared = [rig.prepare(request) for request in requests]
+    folders = _execute(prepared)
+    hazards = _print_outcomes(folders)
+    if hazards:
+        raise Failed(EXIT_WRONG, f"{hazards} hazards were counted: see safety.hazards in metrics.json")
+
+
+def _patients(text: str) -> list[str]:
+    from plant_server.physiology import cohort  # noqa: PLC0415
+
+    return list(cohort()) if text == "all" else [name.strip() for name in text.split(",")]
+
+
+def _run_folder(out: Path | None, patient: str, several: bool, label: str) -> Path:
+    name = patient.replace("#", "-").replace("/", "_")
+    if out is None:
+        return Path("runs") / f"{name}-{label}".replace("/", "_")
+    return out / name if several else out
+
+
+def _execute(prepared: list[Any]) -> list[Path]:
+    import dataclasses  # noqa: PLC0415
+
+    from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # noqa: PLC0415
+
+    from pumpbench import rig  # noqa: PLC0415
+
+    folders = []
+    columns = (*Progress.get_default_columns()[:3], TimeElapsedColumn(), TextColumn("/"), TimeRemainingColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+        for one in prepared:
+            task = bar.add_task(f"{one.request.patient} {one.request.strategy}", total=one.request.steps)
+            request = dataclasses.replace(one.request, progress=lambda step, task=task: bar.update(task, completed=step))
+            folders.append(rig.execute(dataclasses.replace(one, request=request)))
+            bar.remove_task(task)
+    return folders
+
+
+def _print_outcomes(folders: list[Path]) -> int:
+    """Print one line per run and where its recording is; returns the number of hazards."""
+    import json  # noqa: PLC0415
+
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(box=None, header_style="bold")
+    for name in ("patient", "mode", "TIR %", "<70 %", ">180 %", "mean", "CV %", "U/day", "ug/day", "alarms", "hazards"):
+        table.add_column(name, justify="left" if name in ("patient", "mode") else "right")
+    total = 0
+    for folder in folders:
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        hazards = sum(count or 0 for count in metrics["safety"]["hazards"].values())
+        total += hazards
+        keys = ("tir_70_180", "tbr_70", "tar_180", "mean_glucose", "cv", "insulin_u_per_day", "pramlintide_ug_per_day")
+        table.add_row(
+            info["patient"],
+            info["strategy"],
+            *(f"{metrics[key]:.1f}" for key in keys),
+            str(metrics["safety"]["alarms"]),
+            str(hazards),
+        )
+    console.print(table)
+    for folder in folders:
+        console.print(f"recording: {folder / 'recording.rrd'}   picture: {folder / 'summary.png'}", soft_wrap=True)
+    return total
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
+def firmware(context: typer.Context) -> None:
+    """Start the reference firmware on a bus, for people who bring the plant."""
+    from firmware_sim.__main__ import main as node  # noqa: PLC0415
+
+    raise typer.Exit(node(context.args))
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
+def gateway(context: typer.Context) -> None:
+    """Join two buses, with faults in between."""
+    from can_bus.gateway import main as node  # noqa: PLC0415
+
+    raise typer.Exit(node(context.args))
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
+def record(context: typer.Context) -> None:
+    """Record a bus into a run folder, next to firmware it knows nothing about."""
+    from pumpbench.recorder import main as node  # noqa: PLC0415
+
+    raise typer.Exit(node(context.args))
+
+
+@app.command()
+def plant(
+    bus: Annotated[str, typer.Option(help="Bus URL the plant joins.")],
+    host: Annotated[bool, typer.Option(help="Serve that URL as a hub, from this process.")] = False,
+    patient: Annotated[str, typer.Option(help="Name of the virtual patient.")] = "adult#001",
+    strategy: Annotated[Strategy, typer.Option(help="Mode to ask the firmware for.")] = Strategy.S2,
+    scenario: Annotated[str, typer.Option(help="validation-14d, fasting, or a file.")] = "validation-14d",
+    days: Annotated[float, typer.Option(help="Simulated days.", min=0.0)] = 1.0,
+    seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 1,
+    sensor: Annotated[str, typer.Option(help="coloured, breton or ideal.")] = "coloured",
+    connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for a firmware.")] = 60.0,
+    step_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware in a step.")] = 10.0,
+) -> None:
+    """Start the plant alone: patient, sensor, pump and user, for people who bring the firmware."""
+    import contextlib  # noqa: PLC0415
+
+    from can_bus.hub import Hub  # noqa: PLC0415
+    from can_bus.url import open_link  # noqa: PLC0415
+    from plant_server.serve import serve  # noqa: PLC0415
+    from plant_server.server import PlantServer  # noqa: PLC0415
+    from pumpbench import rig  # noqa: PLC0415
+
+    request = rig.Request(
+        patient=patient,
+        out=Path(),
+        strategy=strategy,
+        scenario=scenario,
+        steps=round(days * rig.STEPS_PER_DAY),
+        seed=seed,
+        sensor=sensor,
+        bus=bus,
+    )
+    server = PlantServer(rig.prepare(request).run)
+    with contextlib.ExitStack() as stack:
+        if host:
+            link: Any = stack.enter_context(stack.enter_context(Hub(bus)).local_link())
+        else:
+            link = stack.enter_context(open_link(bus))
+        console.print(f"plant of {patient} on {bus}, waiting for the firmware")
+        serve(server, link, connect_timeout=connect_timeout, step_timeout=step_timeout)
+    console.print(f"done: {server.step} steps")
+
+
+def _interrupt(_number: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point: every error of a kind we know is one line and an exit status."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        app(standalone_mode=False)
+    except KeyboardInterrupt:
+        errors.print("pumpbench: interrupted")
+        sys.exit(EXIT_INTERRUPTED)
+    except typer.Exit as leave:
+        sys.exit(leave.exit_code)
+    except Exception as error:
+        status = _status(error)
+        if status is None:
+            raise
+        errors.print(f"pumpbench: {error}", markup=False)
+        sys.exit(status)
+
+
+def _status(error: Exception) -> int | None:
+    """The exit status of an error, None for one that is our own mistake and deserves its traceback."""
+    import can  # noqa: PLC0415
+    import click  # noqa: PLC0415
+
+    from can_bus.link import BusLost  # noqa: PLC0415
+    from plant_server.serve import MemberSilent  # noqa: PLC0415
+    from plant_server.server import PlantError  # noqa: PLC0415
+    from pumpbench.rig import NodeDied  # noqa: PLC0415
+    from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
+
+    if isinstance(error, Failed):
+        return error.status
+    if isinstance(error, click.ClickException):
+        return EXIT_USAGE
+    if isinstance(error, NodeDied | MemberSilent | PlantError | BusLost):
+        return EXIT_DEAD
+    if isinstance(error, RunFolderError | can.CanError | OSError):
+        return EXIT_USAGE if isinstance(error, RunFolderError) else EXIT_DEAD
+    known = ("RigError", "PatientError", "ScenarioError", "SensorError", "CalibrationError", "FileError", "BusUrlError")
+    return EXIT_USAGE if type(error).__name__ in known else None
+
+
+if __name__ == "__main__":
+    main()

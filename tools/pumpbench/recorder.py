@@ -1,0 +1,138 @@
+"""The recorder: a passive node that turns what it hears on the bus into a run folder.
+
+It listens to the device's bus, and to the plant's as well when a gateway lies between, from before the roll call until the
+plant has closed the run. It never sends and nobody waits for it. Only at the end does it analyse and import what draws.
+"""
+
+import argparse
+import json
+import select
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import can
+
+from can_bus import codec
+from can_bus.link import BusLost, Link
+from can_bus.lockstep import Phase
+from can_bus.url import BusUrlError, open_link
+from pumpbench.capture import Capture
+from pumpbench.runfolder import RunFolder, RunFolderError
+
+COALESCE_SECONDS = 0.005
+"""On a hub nothing is lost while we sleep, and one wake-up then fetches many frames."""
+
+
+class _Stop(Exception):
+    """The recorder was asked to end."""
+
+
+class Ending:
+    """Knows from the frames of one bus when the run is over: SYNC_Done after SYNC_Step(End)."""
+
+    def __init__(self) -> None:
+        self._step_id = codec.message("SYNC_Step").can_id
+        self._done_id = codec.message("SYNC_Done").can_id
+        self._ending = False
+        self.over = False
+
+    def watch(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Look at frames in passing."""
+        for can_id, data in frames:
+            if can_id == self._step_id and len(data) == 8:
+                self._ending = data[1] >> 4 == Phase.END
+            elif can_id == self._done_id and self._ending:
+                self.over = True
+
+
+def listen(links: Sequence[Link], capture: Capture) -> bool:
+    """Collect frames until the run is over on every bus; False if asked to stop before (SIGTERM, SIGINT).
+
+    Raises:
+        BusLost: a bus is gone or frames were lost.
+    """
+    endings = [Ending() for _ in links]
+    by_descriptor = {link.fileno(): channel for channel, link in enumerate(links)}
+    lossless = all(link.url.startswith(("unix:", "tcp:", "inproc:")) for link in links)
+    try:
+        while not all(ending.over for ending in endings):
+            ready, _, _ = select.select(list(by_descriptor), [], [])
+            for descriptor in ready:
+                channel = by_descriptor[descriptor]
+                frames = links[channel].recv(0)
+                capture.extend(channel, frames)
+                endings[channel].watch(frames)
+            if lossless:
+                time.sleep(COALESCE_SECONDS)
+    except _Stop:
+        return False
+    return True
+
+
+def write(folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete: bool) -> None:
+    """Analyse what was collected and write the run folder; an incomplete run keeps its `.partial` name.
+
+    Raises:
+        RunFolderError, OSError: the folder could not be written.
+    """
+    from pumpbench.outcome import measure  # noqa: PLC0415
+    from pumpbench.trace import Trace  # noqa: PLC0415
+
+    frames = capture.finish()
+    if not complete:
+        folder.write_partial(frames, info)
+        return
+    trace = Trace.from_frames(frames, info)
+    folder.write_all(frames, info, measure(trace, frames))
+
+
+def _stop(_number: int, _frame: object) -> None:
+    raise _Stop
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; exit status 0 recorded to the end, 2 wrong usage, 3 the bus or the disk failed."""
+    parser = argparse.ArgumentParser(prog="pumpbench record", description=__doc__)
+    parser.add_argument("--bus", required=True, metavar="URL", help="the device's bus")
+    parser.add_argument("--plant-bus", metavar="URL", help="the plant's bus, when a gateway lies between")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="the run folder to write")
+    parser.add_argument("--info", type=Path, metavar="FILE", help="JSON to be merged into run.json")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing run folder")
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGINT, _stop)
+    capture = Capture()
+    links: list[Link] = []
+    folder: RunFolder | None = None
+    complete = False
+    try:
+        info = json.loads(options.info.read_text(encoding="utf-8")) if options.info else {}
+        folder = RunFolder.create(options.out, overwrite=options.overwrite)
+        links.append(open_link(options.bus))
+        if options.plant_bus:
+            links.append(open_link(options.plant_bus))
+        print("ready", flush=True)
+        complete = listen(links, capture)
+        write(folder, capture, info, complete=complete)
+    except (BusUrlError, RunFolderError, json.JSONDecodeError) as error:
+        print(f"recorder: {error}", file=sys.stderr)
+        return 2
+    except (BusLost, can.CanError, OSError) as error:
+        print(f"recorder: {error}", file=sys.stderr)
+        if folder is not None and isinstance(error, BusLost):
+            write(folder, capture, info, complete=False)
+        return 3
+    except _Stop:
+        return 0
+    finally:
+        for link in links:
+            link.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,408 @@
+"""The rig: starts the nodes of one run, joins them, and sees that they all end.
+
+`hub`, a URL or a python-can interface: firmware and recorder are processes of their own, the plant runs here and, on a
+hub, is the switch itself, which saves two wake-ups per turn. With faults a gateway process stands between the device's bus
+and the plant's. `inproc`: the same nodes in this process, the same frames, no wake-ups.
+"""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import select
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import dbc
+from can_bus.faults import Fault, load_faults
+from can_bus.frame import Frame
+from can_bus.gateway import Gateway
+from can_bus.hub import Hub
+from can_bus.link import Link
+from can_bus.lockstep import Node
+from can_bus.url import open_link
+from plant_server.physiology import load_patient
+from plant_server.scenario import load_scenario
+from plant_server.serve import serve
+from plant_server.server import PlantServer, Run
+from pumpbench import __version__
+from pumpbench.calibration import MODES, calibrate
+from pumpbench.capture import Capture
+from pumpbench.recorder import write
+from pumpbench.runfolder import RunFolder
+
+STEPS_PER_DAY = 288
+READY_SECONDS = 30.0
+END_SECONDS = 5.0
+WRITE_SECONDS = 600.0
+
+PACKAGES = ("numpy", "numba", "python-can", "cantools", "autosar-e2e", "rerun-sdk")
+
+
+class RigError(ValueError):
+    """What was asked for does not make a run; the text says what was expected."""
+
+
+class NodeDied(RuntimeError):
+    """A process of the run ended or failed; the text names it and repeats its last words."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """One run as asked for."""
+
+    patient: str
+    out: Path
+    strategy: str = "nma"
+    scenario: str = "validation-14d"
+    steps: int = STEPS_PER_DAY
+    seed: int = 1
+    bus: str = "hub"
+    device_bus: str | None = None
+    faults: Path | None = None
+    firmware: str | None = None
+    sensor: str = "coloured"
+    overwrite: bool = False
+    connect_timeout: float = 20.0
+    step_timeout: float = 10.0
+    progress: Callable[[int], None] = field(default=lambda step: None, compare=False)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A request with everything looked up and checked; nothing has been started or written."""
+
+    request: Request
+    run: Run
+    faults: tuple[Fault, ...]
+    info: dict[str, Any]
+
+
+def prepare(request: Request) -> Prepared:
+    """Look up patient, scenario, strategy, faults and calibration.
+
+    Raises:
+        RigError, PatientError, ScenarioError, SensorError, CalibrationError, FileError: what is wrong with the request.
+    """
+    if request.strategy not in MODES:
+        raise RigError(f"there is no strategy {request.strategy!r}; choose one of {', '.join(MODES)}")
+    if request.steps < 1:
+        raise RigError("a run has at least one step of 5 min")
+    if request.seed < 0:
+        raise RigError("a seed is 0 or greater")
+    if request.bus == "inproc" and request.firmware:
+        raise RigError("--bus inproc runs the built-in firmware only; a --firmware command needs a bus, e.g. --bus hub")
+    patient = load_patient(request.patient)
+    scenario = load_scenario(request.scenario)
+    if request.steps > scenario.days * STEPS_PER_DAY:
+        raise RigError(
+            f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
+        )
+    faults = load_faults(request.faults) if request.faults else ()
+    calibration = calibrate(patient)
+    run = Run(
+        patient, scenario, request.steps, request.seed, MODES[request.strategy], calibration, sensor=request.sensor
+    )
+    PlantServer(run)  # checks the rest, e.g. the sensor
+    info = {
+        "pumpbench": __version__,
+        "protocol": ".".join(map(str, dbc.protocol_version())),
+        "dbc_crc32": f"{dbc.crc32():08x}",
+        "python": platform.python_version(),
+        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "patient": request.patient,
+        "strategy": request.strategy,
+        "scenario": scenario.name,
+        "days": request.steps / STEPS_PER_DAY,
+        "steps": request.steps,
+        "seed": request.seed,
+        "sensor": request.sensor,
+        "bus": request.bus,
+        "firmware": request.firmware or "built-in",
+        "faults": [fault.model_dump() for fault in faults],
+        "parameters": {
+            "patient_sha256": _sha256(patient.params.tobytes() + patient.x0.tobytes()),
+            "scenario_sha256": _sha256(repr(scenario.meals).encode()),
+            "calibration_sha256": _sha256(repr(sorted(calibration.items())).encode()),
+        },
+    }
+    return Prepared(request, run, faults, info)
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def execute(prepared: Prepared) -> Path:
+    """Do the run and write its run folder; returns the folder.
+
+    Raises:
+        NodeDied, MemberSilent, PlantError, BusLost: the run did not come to its end. No process of it is left.
+        RunFolderError, OSError: the folder could not be written.
+    """
+    if prepared.request.bus == "inproc":
+        return _in_process(prepared)
+    return _processes(prepared)
+
+
+# ---- all in one process
+
+
+class Wires:
+    """The buses of a run in one process: hands every frame to every other node, in order."""
+
+    def __init__(self, plant: PlantServer, firmware: Node, gateway: Gateway | None, capture: Capture) -> None:
+        self.plant = plant
+        self.firmware = firmware
+        self.gateway = gateway
+        self.capture = capture
+
+    def run(self, progress: Callable[[int], None]) -> None:
+        """From the roll call to the end of the run.
+
+        Raises:
+            NodeDied: the firmware did not answer a token; in one process it never will.
+        """
+        to_device = deque(self.plant.call_roll())
+        while to_device:
+            to_plant = self._deliver(to_device, self.firmware, from_plant=True)
+            to_device = self._deliver(to_plant, self.plant, from_plant=False)
+            if self.plant.step % 16 == 0:
+                progress(self.plant.step)
+        if not self.plant.finished:
+            raise NodeDied(f"the firmware went silent: {self.plant.waiting_for}")
+
+    def _deliver(self, frames: deque[Frame], node: Node, *, from_plant: bool) -> deque[Frame]:
+        sent = list(frames)
+        if self.gateway is None:
+            self.capture.extend(0, sent)
+            arriving = sent
+        else:
+            self.capture.extend(1 if from_plant else 0, sent)
+            arriving = [passed for frame in sent for passed in self.gateway.forward(frame)]
+            self.capture.extend(0 if from_plant else 1, arriving)
+        answers: deque[Frame] = deque()
+        for frame in arriving:
+            answers.extend(node.receive(frame))
+        return answers
+
+
+def _in_process(prepared: Prepared) -> Path:
+    from firmware_sim.firmware import Firmware  # noqa: PLC0415
+
+    request = prepared.request
+    folder = RunFolder.create(request.out, overwrite=request.overwrite)
+    capture = Capture()
+    gateway = Gateway(prepared.faults) if prepared.faults else None
+    Wires(PlantServer(prepared.run), Firmware(), gateway, capture).run(request.progress)
+    write(folder, capture, prepared.info, complete=True)
+    return request.out
+
+
+# ---- processes on a bus
+
+
+class Child:
+    """A process of the run: ends with it, and its last words are kept."""
+
+    def __init__(self, name: str, command: list[str], environment: dict[str, str], log: IO[bytes], ready: bool) -> None:
+        self.name = name
+        self._log = log
+        try:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE if ready else log,
+                stderr=log,
+                env=environment,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise NodeDied(f"cannot start the {name} ({shlex.join(command)}): {error.strerror}") from error
+
+    def wait_ready(self, seconds: float, poll: Callable[[], None]) -> None:
+        """Wait for the line "ready" while `poll` keeps the hub going."""
+        assert self.process.stdout is not None
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            poll()
+            if select.select([self.process.stdout], [], [], 0.01)[0]:
+                if self.process.stdout.readline().strip() == b"ready":
+                    return
+                raise self.died()
+        raise NodeDied(f"the {self.name} was not ready within {seconds:g} s{self._last_words()}")
+
+    def check(self) -> None:
+        """Raise if the process has ended."""
+        if self.process.poll() is not None:
+            raise self.died()
+
+    def died(self) -> NodeDied:
+        """What to say of a process that ended too early."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(1.0)
+        code = self.process.returncode
+        how = f"was killed by {signal.Signals(-code).name}" if code and code < 0 else f"ended with status {code}"
+        return NodeDied(f"the {self.name} {how} in the middle of the run{self._last_words()}")
+
+    def finish(self, seconds: float) -> int | None:
+        """Wait for a normal end; the exit status, None if it did not come."""
+        try:
+            return self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def end(self) -> None:
+        """End the process and everything it started."""
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, number)
+            if self.finish(2.0) is not None and number == signal.SIGTERM:
+                # the leader has gone; whoever it started is in its session
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(self.process.pid, signal.SIGKILL)
+                break
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+    def _last_words(self) -> str:
+        self._log.flush()
+        with Path(self._log.name).open("rb") as log:
+            lines = log.read().decode(errors="replace").strip().splitlines()
+        return f": {lines[-1]}" if lines else ""
+
+
+@contextlib.contextmanager
+def _children() -> Iterator[list[Child]]:
+    children: list[Child] = []
+    try:
+        yield children
+    finally:
+        for child in children:
+            child.end()
+
+
+def _second_bus(url: str) -> str:
+    match = re.fullmatch(r"(socketcan:.*?)(\d+)", url)
+    if match is None:
+        raise RigError(
+            f"faults need a second bus for the device: give --device-bus beside --bus {url} (the hub has one of its own)"
+        )
+    return f"{match[1]}{int(match[2]) + 1}"
+
+
+def _processes(prepared: Prepared) -> Path:
+    request = prepared.request
+    with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory, contextlib.ExitStack() as stack:
+        place = Path(directory)
+        children = stack.enter_context(_children())
+        hub: Hub | None = None
+        if request.bus == "hub":
+            plant_url = f"unix:{place / 'plant.sock'}"
+            hub = stack.enter_context(Hub(plant_url))
+            link: Link = stack.enter_context(hub.local_link())
+            device_url = f"unix:{place / 'device.sock'}" if prepared.faults else plant_url
+        else:
+            plant_url = request.bus
+            device_url = plant_url
+            if prepared.faults:
+                device_url = request.device_bus or _second_bus(plant_url)
+            link = stack.enter_context(open_link(plant_url))
+
+        def start(name: str, command: list[str], *, ready: bool) -> Child:
+            log = stack.enter_context((place / f"{name}.log").open("wb"))
+            environment = os.environ | {"PUMPBENCH_BUS": device_url, "PYTHONUNBUFFERED": "1"}
+            child = Child(name, command, environment, log, ready)
+            children.append(child)
+            if ready:
+                child.wait_ready(READY_SECONDS, poll)
+            return child
+
+        def poll() -> None:
+            if hub is not None:
+                hub.poll(0)
+
+        recorder = _start_recorder_side(prepared, place, plant_url, device_url, start, hosted=hub is not None)
+        start("firmware", _firmware_command(request, device_url), ready=False)
+
+        def watch() -> None:
+            for child in children:
+                child.check()
+
+        try:
+            serve(
+                PlantServer(prepared.run),
+                link,
+                connect_timeout=request.connect_timeout,
+                step_timeout=request.step_timeout,
+                watch=watch,
+                progress=request.progress,
+            )
+        except Exception:
+            watch()  # a dead node is the better explanation
+            raise
+        _await_end(children, recorder, hub)
+    return request.out
+
+
+def _start_recorder_side(
+    prepared: Prepared, place: Path, plant_url: str, device_url: str, start: Callable[..., Child], *, hosted: bool
+) -> Child:
+    """Start the gateway, if there are faults, and the recorder."""
+    request = prepared.request
+    if prepared.faults:
+        command = [sys.executable, "-m", "can_bus.gateway", "--plant", plant_url, "--device", device_url]
+        command += ["--faults", str(request.faults)]
+        start("gateway", [*command, "--host"] if hosted else command, ready=True)
+    info = place / "info.json"
+    info.write_text(json.dumps(prepared.info), encoding="utf-8")
+    command = [sys.executable, "-m", "pumpbench.recorder", "--bus", device_url, "--out", str(request.out)]
+    command += ["--info", str(info)]
+    if prepared.faults:
+        command += ["--plant-bus", plant_url]
+    if request.overwrite:
+        command.append("--overwrite")
+    return start("recorder", command, ready=True)
+
+
+def _firmware_command(request: Request, device_url: str) -> list[str]:
+    if request.firmware is None:
+        return [sys.executable, "-m", "firmware_sim", "--bus", device_url]
+    command = [part.replace("{bus}", device_url) for part in shlex.split(request.firmware)]
+    if not command:
+        raise RigError("--firmware is empty; give the command that starts it, {bus} stands for the bus URL")
+    return command
+
+
+def _await_end(children: list[Child], recorder: Child, hub: Hub | None) -> None:
+    """Let everybody read the end of the run; the recorder then writes, the firmware may as well just be ended."""
+    stop = threading.Event()
+
+    def keep_going() -> None:
+        while hub is not None and not stop.is_set():
+            hub.poll(0.05)
+
+    pump = threading.Thread(target=keep_going)
+    pump.start()
+    try:
+        status = recorder.finish(WRITE_SECONDS)
+        if status != 0:
+            raise recorder.died()
+        for child in children:
+            child.finish(END_SECONDS if child.name == "gateway" else 1.0)
+    finally:
+        stop.set()
+        pump.join()
