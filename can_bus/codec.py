@@ -92,7 +92,9 @@ class MessageCodec:
             if signal.is_multiplexer:
                 self.selector = signal.name
         self._initial = initial
-        self._common = tuple(common)
+        self._unsigned = tuple((field.name, field.shift, field.mask) for field in common if not field.sign)
+        self._signed = tuple((field.name, field.shift, field.mask, field.sign) for field in common if field.sign)
+        self._plans: dict[tuple[str, ...], tuple[int, tuple[tuple[int, int, int, int], ...]]] = {}
         self.pages = {key: tuple(fields) for key, fields in pages.items()}
 
     def pack(self, values: Mapping[str, int]) -> int:
@@ -101,16 +103,28 @@ class MessageCodec:
         Raises:
             CodecError: an unknown signal, or a value neither in the signal's range nor one of its named codes.
         """
-        word = self._initial
-        for name, value in values.items():
-            try:
-                _, shift, mask, _, low, high, reserved = self.fields[name]
-            except KeyError:
-                raise CodecError(f"{self.name} has no signal {name}; it has {', '.join(self.fields)}") from None
-            if not low <= value <= high and value not in reserved:
+        names = tuple(values)
+        plan = self._plans.get(names)
+        if plan is None:
+            plan = self._plans[names] = self._plan(names)
+        word, places = plan
+        for (low, high, shift, mask), (name, value) in zip(places, values.items()):  # noqa: B905 (made for each other)
+            if not low <= value <= high and value not in self.fields[name].reserved:
                 raise CodecError(f"{self.name}.{name}: raw value {value} is outside {low}..{high}")
-            word = word & ~(mask << shift) | (value & mask) << shift
+            word |= (value & mask) << shift
         return word
+
+    def _plan(self, names: tuple[str, ...]) -> tuple[int, tuple[tuple[int, int, int, int], ...]]:
+        """The start values with room for these signals; range, shift and mask of each."""
+        word = self._initial
+        places = []
+        for name in names:
+            field = self.fields.get(name)
+            if field is None:
+                raise CodecError(f"{self.name} has no signal {name}; it has {', '.join(self.fields)}")
+            places.append((field.low, field.high, field.shift, field.mask))
+            word &= ~(field.mask << field.shift)
+        return word, tuple(places)
 
     def unpack(self, data: bytes) -> dict[str, int]:
         """Raw values by signal name. No range is checked: a receiver has to distrust every field itself.
@@ -119,7 +133,9 @@ class MessageCodec:
             data: exactly `length` bytes; check it before (`Receiver` does).
         """
         word = int.from_bytes(data, "little")
-        values = {name: ((word >> shift & mask) ^ sign) - sign for name, shift, mask, sign, _, _, _ in self._common}
+        values = {name: word >> shift & mask for name, shift, mask in self._unsigned}
+        for name, shift, mask, sign in self._signed:
+            values[name] = ((word >> shift & mask) ^ sign) - sign
         if self.selector is not None:
             for name, shift, mask, sign, _, _, _ in self.pages.get(values[self.selector], ()):
                 values[name] = ((word >> shift & mask) ^ sign) - sign
