@@ -138,7 +138,7 @@ def _raw(name: str, value: float) -> int:
     import dbc  # noqa: PLC0415
 
     signal = dbc.load().get_message_by_name("CFG_Param").get_signal_by_name(name)
-    raw = round((value - signal.offset) / signal.scale)
+    raw = round((value - float(signal.offset)) / float(signal.scale))
     field = codec.message("CFG_Param").fields[name]
     if not field.low <= raw <= field.high:
         raise CalibrationError(f"{name}: {value:g} {signal.unit} is outside {signal.minimum:g}..{signal.maximum:g}")

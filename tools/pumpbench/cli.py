@@ -18,6 +18,7 @@ app = typer.Typer(
     help="A hardware-in-the-loop bench for insulin + pramlintide pump firmware. Research only, not a medical device.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # a usage error is a line, not a box
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 console = Console(highlight=False)
@@ -134,7 +135,9 @@ def _execute(prepared: list[Any]) -> list[Path]:
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         for one in prepared:
             task = bar.add_task(f"{one.request.patient} {one.request.strategy}", total=one.request.steps)
-            request = dataclasses.replace(one.request, progress=lambda step, task=task: bar.update(task, completed=step))
+            request = dataclasses.replace(
+                one.request, progress=lambda step, task=task: bar.update(task, completed=step)
+            )
             folders.append(rig.execute(dataclasses.replace(one, request=request)))
             bar.remove_task(task)
     return folders
@@ -236,20 +239,51 @@ def plant(
     console.print(f"done: {server.step} steps")
 
 
-def _interrupt(_number: int, _frame: object) -> None:
-    raise KeyboardInterrupt
+@app.command()
+def benchmark(
+    json_file: Annotated[
+        str | None, typer.Option("--json", help="Write the figures to this file; - is stdout.")
+    ] = None,
+    quick: Annotated[bool, typer.Option(help="One short run of each: to see that it works, not to quote.")] = False,
+    only_vcan: Annotated[bool, typer.Option(help="Only the figures of a kernel's vcan0.", hidden=True)] = False,
+) -> None:
+    """Measure speed: each figure beside its ceiling, in one run."""
+    from rich.table import Table  # noqa: PLC0415
+
+    from pumpbench.benchmark.closed_loop import all_figures, as_json  # noqa: PLC0415
+
+    with errors.status("measuring"):
+        figures = all_figures(quick=quick, only_vcan=only_vcan)
+    if json_file == "-":
+        print(as_json(figures))
+        return
+    if json_file:
+        Path(json_file).write_text(as_json(figures) + "\n", encoding="utf-8")
+    table = Table(box=None, header_style="bold")
+    for name in ("figure", "value", "unit", "ceiling", "ratio", "runs"):
+        table.add_column(name, justify="left" if name in ("figure", "unit") else "right")
+    for figure in figures:
+        value, ceiling = f"{figure['value']:,.1f}", f"{figure['ceiling']:,.1f}"
+        table.add_row(figure["name"], value, figure["unit"], ceiling, f"{figure['ratio']:.2f}", str(figure["runs"]))
+    console.print(table)
+    if not any("vcan" in figure["name"] for figure in figures):
+        errors.print("no vcan on this machine and tools/with_vcan could not provide one: its figures are missing")
+
+
+class Interrupted(Exception):
+    """Ctrl-C or SIGTERM."""
+
+
+def _interrupt(number: int, _frame: object) -> None:
+    raise Interrupted(f"interrupted by {signal.Signals(number).name}")
 
 
 def main() -> None:
     """Entry point: every error of a kind we know is one line and an exit status."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
     try:
-        app(standalone_mode=False)
-    except KeyboardInterrupt:
-        errors.print("pumpbench: interrupted")
-        sys.exit(EXIT_INTERRUPTED)
-    except typer.Exit as leave:
-        sys.exit(leave.exit_code)
+        app()
     except Exception as error:
         status = _status(error)
         if status is None:
@@ -261,24 +295,29 @@ def main() -> None:
 def _status(error: Exception) -> int | None:
     """The exit status of an error, None for one that is our own mistake and deserves its traceback."""
     import can  # noqa: PLC0415
-    import click  # noqa: PLC0415
 
-    from can_bus.link import BusLost  # noqa: PLC0415
+    from can_bus.codec import CodecError  # noqa: PLC0415
+    from can_bus.url import BusUrlError  # noqa: PLC0415
+    from can_bus.yaml_file import FileError  # noqa: PLC0415
+    from plant_server.physiology import PatientError  # noqa: PLC0415
+    from plant_server.scenario import ScenarioError  # noqa: PLC0415
+    from plant_server.sensor import SensorError  # noqa: PLC0415
     from plant_server.serve import MemberSilent  # noqa: PLC0415
     from plant_server.server import PlantError  # noqa: PLC0415
-    from pumpbench.rig import NodeDied  # noqa: PLC0415
+    from pumpbench.calibration import CalibrationError  # noqa: PLC0415
+    from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
 
     if isinstance(error, Failed):
         return error.status
-    if isinstance(error, click.ClickException):
+    if isinstance(error, Interrupted):
+        return EXIT_INTERRUPTED
+    wrong = BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
+    if isinstance(error, wrong | CalibrationError | RigError | RunFolderError):
         return EXIT_USAGE
-    if isinstance(error, NodeDied | MemberSilent | PlantError | BusLost):
+    if isinstance(error, NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD
-    if isinstance(error, RunFolderError | can.CanError | OSError):
-        return EXIT_USAGE if isinstance(error, RunFolderError) else EXIT_DEAD
-    known = ("RigError", "PatientError", "ScenarioError", "SensorError", "CalibrationError", "FileError", "BusUrlError")
-    return EXIT_USAGE if type(error).__name__ in known else None
+    return None
 
 
 if __name__ == "__main__":

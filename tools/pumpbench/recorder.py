@@ -1,10 +1,12 @@
 """The recorder: a passive node that turns what it hears on the bus into a run folder.
 
-It listens to the device's bus, and to the plant's as well when a gateway lies between, from before the roll call until the
-plant has closed the run. It never sends and nobody waits for it. Only at the end does it analyse and import what draws.
+It listens to the device's bus, and to the plant's as well when a gateway lies between, from before the roll call until
+the plant has closed the run. It never sends and nobody waits for it. Only at the end does it analyse and import what
+draws.
 """
 
 import argparse
+import contextlib
 import json
 import select
 import signal
@@ -21,7 +23,7 @@ from can_bus.link import BusLost, Link
 from can_bus.lockstep import Phase
 from can_bus.url import BusUrlError, open_link
 from pumpbench.capture import Capture
-from pumpbench.runfolder import RunFolder, RunFolderError
+from pumpbench.runfolder import RunFolder
 
 COALESCE_SECONDS = 0.005
 """On a hub nothing is lost while we sleep, and one wake-up then fetches many frames."""
@@ -77,7 +79,7 @@ def write(folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete
     """Analyse what was collected and write the run folder; an incomplete run keeps its `.partial` name.
 
     Raises:
-        RunFolderError, OSError: the folder could not be written.
+        RunFolderError: the folder could not be written.
     """
     from pumpbench.outcome import measure  # noqa: PLC0415
     from pumpbench.trace import Trace  # noqa: PLC0415
@@ -87,7 +89,7 @@ def write(folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete
         folder.write_partial(frames, info)
         return
     trace = Trace.from_frames(frames, info)
-    folder.write_all(frames, info, measure(trace, frames))
+    folder.write_all(frames, info, measure(trace, frames), trace)
 
 
 def _stop(_number: int, _frame: object) -> None:
@@ -106,32 +108,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _stop)
     signal.signal(signal.SIGINT, _stop)
     capture = Capture()
-    links: list[Link] = []
-    folder: RunFolder | None = None
-    complete = False
-    try:
-        info = json.loads(options.info.read_text(encoding="utf-8")) if options.info else {}
-        folder = RunFolder.create(options.out, overwrite=options.overwrite)
-        links.append(open_link(options.bus))
-        if options.plant_bus:
-            links.append(open_link(options.plant_bus))
+    with contextlib.ExitStack() as stack:
+        try:
+            info = json.loads(options.info.read_text(encoding="utf-8")) if options.info else {}
+            folder = RunFolder.create(options.out, overwrite=options.overwrite)
+            urls = [options.bus, *([options.plant_bus] if options.plant_bus else [])]
+            links = [stack.enter_context(open_link(url)) for url in urls]
+        except (BusUrlError, OSError, can.CanError, json.JSONDecodeError) as error:
+            return _failed(error, 2)
         print("ready", flush=True)
-        complete = listen(links, capture)
-        write(folder, capture, info, complete=complete)
-    except (BusUrlError, RunFolderError, json.JSONDecodeError) as error:
-        print(f"recorder: {error}", file=sys.stderr)
-        return 2
-    except (BusLost, can.CanError, OSError) as error:
-        print(f"recorder: {error}", file=sys.stderr)
-        if folder is not None and isinstance(error, BusLost):
+        try:
+            complete = listen(links, capture)
+        except (BusLost, can.CanError, OSError) as error:
             write(folder, capture, info, complete=False)
-        return 3
-    except _Stop:
-        return 0
-    finally:
-        for link in links:
-            link.close()
+            return _failed(error, 3)
+        try:
+            write(folder, capture, info, complete=complete)
+        except (OSError, ValueError) as error:
+            return _failed(error, 3)
     return 0
+
+
+def _failed(error: Exception, status: int) -> int:
+    print(f"recorder: {error}", file=sys.stderr)
+    return status
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """The rig: starts the nodes of one run, joins them, and sees that they all end.
 
 `hub`, a URL or a python-can interface: firmware and recorder are processes of their own, the plant runs here and, on a
-hub, is the switch itself, which saves two wake-ups per turn. With faults a gateway process stands between the device's bus
-and the plant's. `inproc`: the same nodes in this process, the same frames, no wake-ups.
+hub, is the switch itself, which saves two wake-ups per turn. With faults a gateway process stands between the device's
+bus and the plant's. `inproc`: the same nodes in this process, the same frames, no wake-ups.
 """
 
 import contextlib
@@ -153,9 +153,14 @@ def execute(prepared: Prepared) -> Path:
         NodeDied, MemberSilent, PlantError, BusLost: the run did not come to its end. No process of it is left.
         RunFolderError, OSError: the folder could not be written.
     """
-    if prepared.request.bus == "inproc":
-        return _in_process(prepared)
-    return _processes(prepared)
+    folder = RunFolder.create(prepared.request.out, overwrite=prepared.request.overwrite)
+    try:
+        if prepared.request.bus == "inproc":
+            return _in_process(prepared, folder)
+        return _processes(prepared)
+    finally:
+        if folder.partial.is_dir() and not any(folder.partial.iterdir()):
+            folder.discard()
 
 
 # ---- all in one process
@@ -200,11 +205,10 @@ class Wires:
         return answers
 
 
-def _in_process(prepared: Prepared) -> Path:
+def _in_process(prepared: Prepared, folder: RunFolder) -> Path:
     from firmware_sim.firmware import Firmware  # noqa: PLC0415
 
     request = prepared.request
-    folder = RunFolder.create(request.out, overwrite=request.overwrite)
     capture = Capture()
     gateway = Gateway(prepared.faults) if prepared.faults else None
     Wires(PlantServer(prepared.run), Firmware(), gateway, capture).run(request.progress)
@@ -299,7 +303,7 @@ def _second_bus(url: str) -> str:
     match = re.fullmatch(r"(socketcan:.*?)(\d+)", url)
     if match is None:
         raise RigError(
-            f"faults need a second bus for the device: give --device-bus beside --bus {url} (the hub has one of its own)"
+            f"faults need a second bus for the device: give --device-bus beside --bus {url} (a hub has one of its own)"
         )
     return f"{match[1]}{int(match[2]) + 1}"
 
@@ -370,11 +374,9 @@ def _start_recorder_side(
     info = place / "info.json"
     info.write_text(json.dumps(prepared.info), encoding="utf-8")
     command = [sys.executable, "-m", "pumpbench.recorder", "--bus", device_url, "--out", str(request.out)]
-    command += ["--info", str(info)]
+    command += ["--info", str(info), "--overwrite"]
     if prepared.faults:
         command += ["--plant-bus", plant_url]
-    if request.overwrite:
-        command.append("--overwrite")
     return start("recorder", command, ready=True)
 
 

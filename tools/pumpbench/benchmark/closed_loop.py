@@ -1,0 +1,143 @@
+"""How fast the closed loop runs, beside what its transport would allow and what its plant costs.
+
+The ceiling of a bus is the bare exchange of the same number of frames per step in both directions between the same
+number of processes: prebuilt bytes on raw sockets, nothing packed, checked, integrated or decided. The ceiling of the
+loop in one process is the plant alone.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from can_bus import codec
+from plant_server import physiology
+from plant_server.mechanism import SUBSTEPS
+from pumpbench import rig
+from pumpbench.benchmark.round_trips import CEILING_OF, Figure, measure, round_trips, vcan_available
+from pumpbench.trace import decode
+
+STEPS_PER_DAY = rig.STEPS_PER_DAY
+PATIENT = "adult#002"
+STRATEGY = "s2"
+WITH_VCAN = Path(__file__).parents[3] / "tools" / "with_vcan"
+
+
+def plant_alone(*, days: int = 100, runs: int = 5) -> list[Figure]:
+    """Patient-days per second of the integration alone, pramlintide and variability on.
+
+    In calls of one sampling interval, as the bench makes them; the ceiling is one call per day.
+    """
+    patient = physiology.load_patient(PATIENT)
+    p = physiology.Variability(1, PATIENT).apply(patient.params)
+
+    def rate(chunk: int) -> float:
+        x = patient.x0.copy()
+        insulin = np.full(chunk, patient.basal_u_per_h / 120)
+        pramlintide = np.full(chunk, 10 * patient.basal_u_per_h / 120)
+        carbs = np.zeros(chunk)
+        calls = days * STEPS_PER_DAY * SUBSTEPS // chunk
+        minutes = chunk * physiology.STEP_MIN
+        start = time.perf_counter()
+        for call in range(calls):
+            if call * minutes % 360 == 0:
+                physiology.begin_meal(x, p, 50000.0)
+            physiology.advance(x, p, call * minutes, insulin, pramlintide, carbs)
+        return days / (time.perf_counter() - start)
+
+    rate(SUBSTEPS)
+    values = [rate(SUBSTEPS) for _ in range(runs)]
+    ceilings = [rate(STEPS_PER_DAY * SUBSTEPS) for _ in range(runs)]
+    return [_figure("plant/alone", values, ceilings)]
+
+
+def _figure(name: str, values: list[float], ceilings: list[float]) -> Figure:
+    value, ceiling = median(values), median(ceilings)
+    return Figure(
+        name=name,
+        value=round(value, 2),
+        unit="patient-days/s",
+        ceiling=round(ceiling, 2),
+        ratio=round(value / ceiling, 3),
+        runs=len(values),
+    )
+
+
+def closed_loop(kind: str, *, days: int, runs: int = 3) -> Figure:
+    """Patient-days per second of whole runs on one kind of bus: `inproc`, `hub` or `vcan`, recorder listening.
+
+    Start-up and the writing of the run folder are left out.
+    """
+    bus = {"vcan": "socketcan:vcan0"}.get(kind, kind)
+    values, ceilings = [], []
+    with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory:
+        for number in range(runs):
+            out = Path(directory) / f"{kind}-{number}"
+            stamps: list[tuple[int, float]] = []
+            request = rig.Request(
+                patient=PATIENT,
+                out=out,
+                strategy=STRATEGY,
+                steps=days * STEPS_PER_DAY,
+                bus=bus,
+                progress=lambda step, stamps=stamps: stamps.append((step, time.perf_counter())),  # type: ignore[misc]
+            )
+            rig.execute(rig.prepare(request))
+            (first, started), (last, ended) = stamps[1], stamps[-1]
+            values.append((last - first) / STEPS_PER_DAY / (ended - started))
+            if kind != "inproc":
+                to_device, back = _frames_per_step(out)
+                bare = measure(CEILING_OF[kind], 2000, to_device, back, True)
+                ceilings.append(bare.rate / STEPS_PER_DAY)
+    if kind == "inproc":
+        ceilings = [plant_alone(days=20, runs=3)[0]["value"]]
+    return _figure(f"closed-loop/{kind}", values, ceilings)
+
+
+def _frames_per_step(folder: Path) -> tuple[int, int]:
+    """How many frames go to the device and come back in a usual step of this run."""
+    from pumpbench.runfolder import RunFolder  # noqa: PLC0415
+
+    frames = RunFolder.load(folder).frames
+    senders = {codec_.can_id: codec_.sender for codec_ in codec.messages().values()}
+    from_device = np.isin(frames.can_id, [can_id for can_id, sender in senders.items() if sender == "CTRL"])
+    steps = len(decode(frames, "SYNC_Done").rows)
+    return round(float(np.sum(~from_device)) / steps), round(float(np.sum(from_device)) / steps)
+
+
+def all_figures(*, quick: bool, only_vcan: bool = False) -> list[Figure]:
+    """Every figure this machine can give; on a kernel without CAN those of vcan come from `tools/with_vcan`."""
+    runs, days = (1, 1) if quick else (5, 5)
+    steps = 500 if quick else 5000
+    if only_vcan:
+        return [
+            *round_trips(["vcan"], steps=steps // 2, runs=runs),
+            closed_loop("vcan", days=1, runs=min(runs, 3)),
+        ]
+    figures = plant_alone(days=10 if quick else 100, runs=runs)
+    figures += round_trips(["hub"], steps=steps, runs=runs)
+    figures += [closed_loop("inproc", days=days, runs=runs), closed_loop("hub", days=days, runs=runs)]
+    if vcan_available():
+        return figures + all_figures(quick=quick, only_vcan=True)
+    return figures + _in_guest(quick=quick)
+
+
+def _in_guest(*, quick: bool) -> list[Figure]:
+    if not WITH_VCAN.exists():
+        return []
+    command = [str(WITH_VCAN), "--", sys.executable, "-m", "pumpbench", "benchmark", "--only-vcan", "--json", "-"]
+    done = subprocess.run([*command, "--quick"] if quick else command, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        return []
+    figures: list[Figure] = json.loads(done.stdout)
+    return figures
+
+
+def as_json(figures: list[Figure]) -> str:
+    """The figures as a JSON list of objects with name, value, unit, ceiling, ratio, runs."""
+    return json.dumps([dict(figure) for figure in figures], indent=1)
