@@ -21,6 +21,8 @@ MAX_DATA: Final = 8
 
 RECORD: Final = struct.Struct("<IB3x8s")
 RECORD_SIZE: Final = RECORD.size
+_SIZES = tuple(range(MAX_DATA + 1))
+_ZEROS = bytes(MAX_DATA)
 _pack_record = RECORD.pack
 _iter_records = RECORD.iter_unpack
 _new = tuple.__new__
@@ -66,12 +68,10 @@ def pack(frames: Iterable[Frame]) -> bytes:
     standard id stays below 0x800: a faulty node can send such a frame too.
     """
     try:
-        packed = b"".join([_pack_record(can_id, len(data), data) for can_id, data in frames])
-    except struct.error as error:
-        raise ValueError(f"not a classic CAN frame: {error}") from error
-    if packed and max(packed[4::RECORD_SIZE]) > MAX_DATA:
-        raise ValueError("not a classic CAN frame: more than 8 data bytes")
-    return packed
+        return b"".join([_pack_record(can_id, _SIZES[len(data)], data) for can_id, data in frames])
+    except (struct.error, IndexError) as error:
+        reason = "more than 8 data bytes" if isinstance(error, IndexError) else error
+        raise ValueError(f"not a classic CAN frame: {reason}") from error
 
 
 def unpack(buffer: bytes | bytearray) -> list[Frame]:
@@ -79,12 +79,10 @@ def unpack(buffer: bytes | bytearray) -> list[Frame]:
 
     Bytes beyond the DLC and the padding are ignored; the data of remote frames becomes zero bytes.
     """
-    frames = [_new(Frame, (can_id, data[:size])) for can_id, size, data in _iter_records(buffer)]
-    if max(buffer[3::RECORD_SIZE], default=0) & 0x60:  # a remote frame may be among them (error frames are as rare)
-        frames = [
-            Frame(frame.can_id, bytes(len(frame.data))) if frame.can_id & CAN_RTR_FLAG else frame for frame in frames
-        ]
-    return frames
+    return [
+        _new(Frame, (can_id, (data if not can_id & CAN_RTR_FLAG else _ZEROS)[:size]))
+        for can_id, size, data in _iter_records(buffer)
+    ]
 
 
 def to_message(frame: Frame, timestamp: float = 0.0, channel: str | None = None, is_rx: bool = True) -> can.Message:

@@ -39,19 +39,23 @@ from can_bus.link import BaseLink
 _log = logging.getLogger("can_bus.hub")
 
 DEFAULT_CAP: Final = 262_144
-_CHUNK: Final = 65536
+_CHUNK: Final = 16384
 _LINGER: Final = 10.0
 _IN: Final = select.EPOLLIN
 _OUT: Final = select.EPOLLOUT
+_EVENTS: Final = 64
+_LEN: Final = hub_wire.LEN_OFFSET
 
 
 class _Client:
     """One connection: greeting (no hello yet), member (on the bus) or leaving (gets its goodbye)."""
 
-    __slots__ = ("deadline", "echo", "fd", "member", "mute", "name", "out", "partial", "sock", "tcp")
+    __slots__ = ("deadline", "echo", "fd", "member", "mute", "name", "out", "partial", "recv", "send", "sock", "tcp")
 
     def __init__(self, sock: socket.socket, name: str, tcp: bool) -> None:
         self.sock = sock
+        self.recv = sock.recv
+        self.send = sock.send
         self.fd = sock.fileno()
         self.name = name
         self.tcp = tcp
@@ -93,7 +97,7 @@ class Hub:
         self._members: tuple[_Client, ...] = ()
         self._leaving = 0
         self._locals: tuple[LocalLink, ...] = ()
-        self._closed = False
+        self.closed = False
         self._stopping = False
         self._selected = False
         self._server: threading.Thread | None = None
@@ -196,12 +200,12 @@ class Hub:
 
     def poll(self, timeout: float | None) -> bool:
         """Wait up to ``timeout`` seconds (None: for ever) for something to do, do it; False when there was nothing."""
-        if self._closed:
+        if self.closed:
             raise ValueError("the hub is closed")
         if self._leaving:
             timeout = self._expire(timeout)
         batches: list[tuple[_Client, bytes]] = []
-        events = self._epoll.poll(timeout)
+        events = self._epoll.poll(timeout, _EVENTS)
         for fd, event in events:
             client = self._clients.get(fd)
             if client is None:
@@ -209,7 +213,7 @@ class Hub:
                 continue
             if event & _OUT:
                 self._drain(client)
-            if event & ~_OUT:
+            if event != _OUT:
                 records = self._read(client)
                 if records:
                     batches.append((client, records))
@@ -294,7 +298,7 @@ class Hub:
     def _read(self, client: _Client) -> bytes:
         """Return the complete records a member sent, b"" when there are none (or it is gone)."""
         try:
-            chunk = client.sock.recv(_CHUNK)
+            chunk = client.recv(_CHUNK)
         except BlockingIOError:
             return b""
         except OSError:
@@ -302,20 +306,21 @@ class Hub:
         if not chunk:
             self._forget(client)
             return b""
-        if client.deadline is not None:
-            return b""
-        if client.partial:
+        if not client.member or client.partial or len(chunk) % RECORD_SIZE:
+            if client.deadline is not None:
+                return b""
             chunk = client.partial + chunk
-            client.partial = b""
-        if not client.member:
-            chunk = self._greet(client, chunk)
-        rest = len(chunk) % RECORD_SIZE
-        if rest and client.member:
-            client.partial = chunk[-rest:]
-            chunk = chunk[:-rest]
-        if not chunk or not client.member:
-            return b""
-        longest = max(chunk[hub_wire.LEN_OFFSET :: RECORD_SIZE])
+            if not client.member:
+                client.partial = b""
+                chunk = self._greet(client, chunk)
+                if not client.member:
+                    return b""
+            whole = len(chunk) - len(chunk) % RECORD_SIZE
+            client.partial = chunk[whole:]
+            chunk = chunk[:whole]
+            if not chunk:
+                return b""
+        longest = chunk[_LEN] if len(chunk) == RECORD_SIZE else max(chunk[_LEN::RECORD_SIZE])
         if longest > MAX_DATA:
             _log.error("%s sent a record of length %d: disconnected", client.name, longest)
             self._dismiss(client, Reason.MALFORMED, longest)
@@ -354,14 +359,16 @@ class Hub:
             for client in self._members:
                 if client is not sender or client.echo:
                     self._push(client, records)
+            for link in self._locals:
+                link.deliver(records)
         else:
             for client in self._members:
                 records = b"".join([chunk for sender, chunk in batches if client is not sender or client.echo])
                 if records:
                     self._push(client, records)
-        if self._locals:
-            for link in self._locals:
-                for _, records in batches:
+            if self._locals:
+                records = b"".join([chunk for _, chunk in batches])
+                for link in self._locals:
                     link.deliver(records)
 
     def switch_local(self, link: LocalLink, records: bytes) -> None:
@@ -381,7 +388,7 @@ class Hub:
             if client.mute:
                 return
             try:
-                sent = client.sock.send(records)
+                sent = client.send(records)
             except BlockingIOError:
                 sent = 0
             except OSError:
@@ -402,7 +409,7 @@ class Hub:
         try:
             while out:
                 with memoryview(out) as view:
-                    sent = client.sock.send(view[: 4 * _CHUNK])
+                    sent = client.sock.send(view[: 16 * _CHUNK])
                 del out[:sent]
         except BlockingIOError:
             return
@@ -472,11 +479,6 @@ class Hub:
 
     # -- the end of the hub ------------------------------------------------------------------------------------
 
-    @property
-    def closed(self) -> bool:
-        """Whether ``close`` was called."""
-        return self._closed
-
     def fileno(self) -> int:
         """The descriptor to select on when something else must be watched too; readable means: call ``poll(0)``."""
         self._selected = True
@@ -492,7 +494,7 @@ class Hub:
         A reader that does not take its frames within ``linger`` seconds in all loses them, with an error in the log
         here and a ``BusLost`` there.
         """
-        if self._closed:
+        if self.closed:
             return
         server = self._server
         if server is not None and server is not threading.current_thread():
@@ -518,7 +520,7 @@ class Hub:
             self.poll(left)
         for client in list(self._clients.values()):
             self._part(client)
-        self._closed = True
+        self.closed = True
         self._stopping = True
         self._epoll.close()
         os.close(self._wake)
@@ -556,14 +558,14 @@ class LocalLink(BaseLink):
     def deliver(self, records: bytes) -> None:
         """Called by the hub: these records are for this link."""
         frames = unpack(records)
-        self._pending += frames if self._wanted is None else self._wanted.select(frames)
+        if self._wanted is not None:
+            frames = self._wanted.select(frames)
+        self._pending = self._pending + frames if self._pending else frames
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Run the hub until frames for this node arrived; see ``Link.recv``."""
         hub = self._hub
-        if self._dead is not None:
-            raise self._lose("")
-        if hub.closed:
+        if hub.closed or self._dead is not None:
             raise self._lose("the hub was closed")
         if not self._pending:
             if timeout is None:
@@ -575,21 +577,18 @@ class LocalLink(BaseLink):
                 while not self._pending and (left := end - time.monotonic()) > 0:
                     hub.poll(left)
         frames = self._pending
-        if frames:
-            self._pending = []
+        self._pending = []
         return frames
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Put the batch on the bus; never blocks."""
-        if self._dead is not None:
-            raise self._lose("")
-        if self._hub.closed:
-            raise self._lose("the hub was closed")
         if frames:
-            self._hub.switch_local(self, pack(frames))
+            self.send_packed(pack(frames))
 
     def send_packed(self, records: bytes) -> None:
         """Put on the bus what ``pack`` made."""
+        if self._hub.closed or self._dead is not None:
+            raise self._lose("the hub was closed")
         self._hub.switch_local(self, records)
 
     def fileno(self) -> int:

@@ -9,16 +9,16 @@ import struct
 import termios
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import can
 
 from can_bus import hub_wire
 from can_bus.address import Address, parse_address
-from can_bus.frame import RECORD_SIZE, Frame, pack, unpack
-from can_bus.link import BaseLink
+from can_bus.frame import MAX_DATA, RECORD_SIZE, Frame, pack, unpack
+from can_bus.link import BaseLink, BusLost
 
-_CHUNK = 65536
+_CHUNK = 16384  # larger allocations cost more than the second receive they save
 _SEND_LIMIT = 60.0
 _CLOSE_LIMIT = 2.0
 _RETRY = 0.02
@@ -60,7 +60,6 @@ class HubLink(BaseLink):
         super().__init__(url, filters)
         self._partial = b""
         self._timeout: float | None = None
-        self._goodbye: str | None = None
         self._lock = threading.Lock()
         address = parse_address(url)
         self._tcp = address.is_tcp
@@ -77,6 +76,7 @@ class HubLink(BaseLink):
         except BaseException:
             self._socket.close()
             raise
+        self._read: Callable[..., bytes] = self._socket.recv
 
     def _greet(self, echo: bool, timeout: float) -> None:
         answer = b""
@@ -105,93 +105,96 @@ class HubLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return all frames that arrived, waiting for the first; see ``Link.recv``."""
-        frames = self._receive(timeout, _CHUNK)
-        wanted = self._wanted
-        if wanted is None or not frames:
-            return frames
-        chosen = wanted.select(frames)
-        if chosen or timeout == 0:
-            return chosen
+        if self._wanted is None:
+            return self._receive(timeout, _CHUNK)
         end = None if timeout is None else time.monotonic() + timeout
-        while not chosen:
-            left = None if end is None else max(0.0, end - time.monotonic())
-            frames = self._receive(left, _CHUNK)
-            if not frames:
-                return frames
-            chosen = wanted.select(frames)
-        return chosen
+        while True:
+            frames = self._receive(timeout, _CHUNK)
+            chosen = self._wanted.select(frames)
+            if chosen or not frames:
+                return chosen
+            if end is not None:
+                timeout = max(0.0, end - time.monotonic())
 
     def recv_one(self, timeout: float | None) -> Frame | None:
         """Return one frame, or None on time-out; the next one stays in the socket, where ``select`` sees it."""
         end = None if timeout is None else time.monotonic() + timeout
         while True:
             frames = self._receive(timeout, RECORD_SIZE - len(self._partial))
-            if self._wanted is not None:
-                frames = self._wanted.select(frames)
-            if frames:
-                return frames[0]
+            chosen = frames if self._wanted is None else self._wanted.select(frames)
+            if chosen or not frames:
+                return chosen[0] if chosen else None
             if end is not None:
-                timeout = end - time.monotonic()
-                if timeout <= 0:
-                    return None
+                timeout = max(0.0, end - time.monotonic())
 
     def _receive(self, timeout: float | None, size: int) -> list[Frame]:
-        while True:
-            if self._goodbye is not None:
-                raise self._lose(self._goodbye)
-            if self._dead is not None:
-                raise self._lose("")
-            try:
-                if timeout == 0:
-                    chunk = self._socket.recv(size, socket.MSG_DONTWAIT)
-                else:
-                    if timeout != self._timeout:
-                        self._set_timeout(timeout)
-                    chunk = self._socket.recv(size)
-            except BlockingIOError:
-                return []
-            except OSError as error:
-                raise self._lose(f"the hub is gone ({error.strerror})") from error
+        try:
+            if timeout == 0:
+                chunk = self._read(size, socket.MSG_DONTWAIT)
+            else:
+                if timeout != self._timeout:
+                    self._set_timeout(timeout)
+                chunk = self._read(size)
+        except BlockingIOError:
+            return []
+        except can.CanError:
+            raise
+        except OSError as error:
+            raise self._lose(f"the hub is gone ({error.strerror})") from error
+        if len(chunk) % RECORD_SIZE or self._partial or not chunk or chunk[_LEN_OF_LAST] > MAX_DATA:
+            chunk = self._sort_out(chunk)
+            if not chunk:  # so far only a part of a record came
+                return self._receive(timeout, RECORD_SIZE - len(self._partial))
+        return unpack(chunk)
+
+    def _sort_out(self, chunk: bytes) -> bytes:
+        """Return the complete records in what came; the end of the stream or a goodbye in front raises."""
+        if not chunk:
+            raise self._lose("the hub is gone (it closed the connection without a goodbye)")
+        chunk = self._partial + chunk
+        whole = len(chunk) - len(chunk) % RECORD_SIZE
+        self._partial = chunk[whole:]
+        chunk = chunk[:whole]
+        if chunk and chunk[_LEN_OF_LAST] > MAX_DATA:
+            reason = hub_wire.goodbye_text(chunk[-RECORD_SIZE:]) or "the hub sent a malformed record"
+            chunk = chunk[:-RECORD_SIZE]
+            lost = self._lose(reason)
             if not chunk:
-                raise self._lose("the hub is gone (it closed the connection without a goodbye)")
-            if self._partial:
-                chunk = self._partial + chunk
-                self._partial = b""
-            rest = len(chunk) % RECORD_SIZE
-            if rest:
-                self._partial = chunk[-rest:]
-                chunk = chunk[:-rest]
-                if not chunk:
-                    continue
-            if chunk[_LEN_OF_LAST] == hub_wire.GOODBYE_LEN:
-                self._goodbye = hub_wire.goodbye_text(chunk[-RECORD_SIZE:])
-                chunk = chunk[:-RECORD_SIZE]
-                if not chunk:
-                    continue
-            return unpack(chunk)
+                raise lost
+        return chunk
+
+    def _lose(self, reason: str) -> BusLost:
+        self._read = self._refuse
+        return super()._lose(reason)
+
+    def _refuse(self, size: int, flags: int = 0) -> bytes:
+        raise self._lose("")
 
     def _set_timeout(self, timeout: float | None) -> None:
         """Let the kernel bound the next receives: one system call less than poll and receive."""
-        value = _TIMEVAL.pack(0, 0) if timeout is None else timeval(timeout)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
-        self._timeout = timeout
+        if self._dead is None:
+            value = _TIMEVAL.pack(0, 0) if timeout is None else timeval(timeout)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
+            self._timeout = timeout
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Send the batch in one system call; blocks while the hub's host is busy and the socket is full."""
-        if self._dead is not None:
-            raise self._lose("")
         if frames:
             self.send_packed(pack(frames))
 
     def send_packed(self, records: bytes) -> None:
         """Send what ``pack`` made. The caller vouches for the format: a malformed record ends the connection."""
+        if self._dead is not None:
+            raise self._lose("")
         try:
             with self._lock:
                 if self._hangup is not None and self._hangup.poll(0):  # TCP would swallow the first batch silently
-                    raise self._lose(self._goodbye or "the hub is gone")
+                    raise self._lose("the hub is gone")
                 self._socket.sendall(records)
         except BlockingIOError as error:
             raise self._lose(f"the hub has not read for {_SEND_LIMIT:g} s") from error
+        except can.CanError:
+            raise
         except OSError as error:
             raise self._lose(f"the hub is gone ({error.strerror})") from error
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
+import os
 import socket
 import struct
 import time
@@ -23,8 +25,9 @@ _SO_MEMINFO = 55
 _MEMINFO_DROPS = 8
 _RECEIVE_BUFFER = 64 << 20
 _COUNTER = struct.Struct("@I")
-_ANCILLARY = socket.CMSG_SPACE(_COUNTER.size)
-_BATCH = 4096
+_FLAGS = struct.Struct("@i")
+MSG_WAITFORONE = 0x10000
+_BATCH = 256
 _SEND_LIMIT = 5.0
 _SLICE = 1.0
 
@@ -46,6 +49,8 @@ class SocketcanLink(BaseLink):
         self._bus = _open(channel)
         self._socket: socket.socket = self._bus.socket
         self._timeout: float | None = None
+        self._inbox = FrameBatch(self._socket.fileno())
+        self._outboxes = [FrameBatch(self._socket.fileno())]
         self._socket.setblocking(True)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
@@ -59,47 +64,46 @@ class SocketcanLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return all frames that wait, waiting for the first; see ``Link.recv``."""
-        end = None if timeout is None else time.monotonic() + timeout
+        left = timeout
+        end: float | None = None  # the clock is only read when the first look was not enough: a guest pays for it
         while True:
-            frames = self._receive(timeout if timeout is not None and timeout < _SLICE else _SLICE)
-            if self._wanted is not None:  # the first ones may have come before the kernel's filter was set
-                frames = self._wanted.select(frames)
+            wait = _SLICE if left is None or left > _SLICE else left
+            frames = self._receive(wait)
             if frames:
-                return frames
-            self._check_drops()
-            if end is not None:
-                timeout = end - time.monotonic()
-                if timeout <= 0:
+                if self._wanted is not None:  # the first ones may have come before the kernel's filter was set
+                    frames = self._wanted.select(frames)
+                if frames:
+                    return frames
+                wait = 0.0
+            else:
+                self._check_drops()
+            if left is not None:
+                now = time.monotonic()
+                end = now + left - wait if end is None else end
+                left = end - now
+                if left <= 0:
                     return frames
 
     def _receive(self, timeout: float) -> list[Frame]:
         if self._dead is not None:
             raise self._lose("")
-        receive = self._socket.recvmsg
-        records: list[bytes] = []
-        flags = 0
         if timeout <= 0:
-            flags = socket.MSG_DONTWAIT
-        elif timeout != self._timeout:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeval(timeout))
-            self._timeout = timeout
+            flags = int(socket.MSG_DONTWAIT)
+        else:
+            flags = MSG_WAITFORONE
+            if timeout != self._timeout:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeval(timeout))
+                self._timeout = timeout
+        batch = self._inbox
         try:
-            while len(records) < _BATCH:
-                record, ancillary, _, _ = receive(RECORD_SIZE, _ANCILLARY, flags)
-                if ancillary:
-                    self._count(ancillary)
-                records.append(record)
-                flags = socket.MSG_DONTWAIT
+            count = batch.receive(flags)
         except BlockingIOError:
-            pass
+            return []
         except OSError as error:
             raise self._lose(f"the interface is gone ({error.strerror})") from error
-        return unpack(b"".join(records))
-
-    def _count(self, ancillary: list[tuple[int, int, bytes]]) -> None:
-        for level, kind, value in ancillary:
-            if level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
-                self._lost_frames(*_COUNTER.unpack(value))
+        if batch.truncated(count - 1):  # there was a drop count to report, and no room for it
+            self._check_drops()
+        return unpack(batch.bytes(count))
 
     def _check_drops(self) -> None:
         """Ask for the drop count: a loss with nothing behind it shows in no received frame."""
@@ -112,30 +116,28 @@ class SocketcanLink(BaseLink):
             raise self._lose(f"{count} frames lost: this reader was too slow for the kernel's receive queue")
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send the frames one by one; a full transmit queue is waited out for some seconds, then raises ``BusLost``."""
+        """Send the batch; a full transmit queue is waited out for some seconds, then it raises ``BusLost``."""
         if self._dead is not None:
             raise self._lose("")
         records = pack(frames)
-        send = self._socket.send
-        for start in range(0, len(records), RECORD_SIZE):
-            record = records[start : start + RECORD_SIZE]
+        try:
+            outbox = self._outboxes.pop()  # no lock: it would read the clock, which is dear in a guest
+        except IndexError:
+            outbox = FrameBatch(self._socket.fileno())
+        end: float | None = None
+        while records:
             try:
-                send(record)
+                records = records[outbox.send(records) * RECORD_SIZE :]
             except OSError as error:
-                self._send_again(record, error)
-
-    def _send_again(self, record: bytes, error: OSError) -> None:
-        end = time.monotonic() + _SEND_LIMIT
-        while error.errno == errno.ENOBUFS and time.monotonic() < end:
-            time.sleep(1e-3)
-            try:
-                self._socket.send(record)
-                return
-            except OSError as again:
-                error = again
-        if error.errno == errno.ENOBUFS:
-            raise self._lose(f"the transmit queue stayed full for {_SEND_LIMIT:g} s, is the wire open?") from error
-        raise self._lose(f"cannot send ({error.strerror})") from error
+                if error.errno != errno.ENOBUFS:
+                    raise self._lose(f"cannot send ({error.strerror})") from error
+                now = time.monotonic()
+                end = end or now + _SEND_LIMIT
+                if now > end:
+                    reason = f"the transmit queue stayed full for {_SEND_LIMIT:g} s, is the wire open?"
+                    raise self._lose(reason) from error
+                time.sleep(1e-3)
+        self._outboxes.append(outbox)
 
     def fileno(self) -> int:
         """The raw CAN socket."""
@@ -146,6 +148,80 @@ class SocketcanLink(BaseLink):
         if self._socket.fileno() >= 0:
             self._closed()
             self._bus.shutdown()
+
+
+class _IoVector(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _MessageHeader(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.POINTER(_IoVector)),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    _fields_ = (("header", _MessageHeader), ("length", ctypes.c_uint))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class FrameBatch:
+    """Room for many frames, moved by one ``recvmmsg`` or ``sendmmsg`` (Python's own calls move one frame each)."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._buffer = ctypes.create_string_buffer(_BATCH * RECORD_SIZE)
+        self._view = memoryview(self._buffer).cast("B")
+        base = ctypes.addressof(self._buffer)
+        self._vectors = (_IoVector * _BATCH)(*[_IoVector(base + i * RECORD_SIZE, RECORD_SIZE) for i in range(_BATCH)])
+        self._messages = (_Message * _BATCH)()
+        for i, message in enumerate(self._messages):
+            message.header.vectors = ctypes.pointer(self._vectors[i])
+            message.header.vector_count = 1
+        self._headers = memoryview(self._messages).cast("B")
+        self._place = ctypes.byref(self._messages)
+
+    def receive(self, flags: int) -> int:
+        """Return how many frames were received; OSError as ``recv`` would raise it."""
+        while (count := _libc.recvmmsg(self._descriptor, self._place, _BATCH, flags, None)) < 0:
+            _raise_errno()
+        return int(count)
+
+    def send(self, records: bytes) -> int:
+        """Return how many of the records were sent, at least one; OSError as ``send`` would raise it."""
+        size = min(len(records), len(self._view))
+        self._view[:size] = records[:size]
+        while (count := _libc.sendmmsg(self._descriptor, self._place, size // RECORD_SIZE, 0)) < 0:
+            _raise_errno()
+        return int(count)
+
+    def truncated(self, index: int) -> bool:
+        """Whether control data of a received frame found no room."""
+        (flags,) = _FLAGS.unpack_from(self._headers, index * _MESSAGE_SIZE + _FLAGS_OFFSET)
+        return bool(flags & socket.MSG_CTRUNC)
+
+    def bytes(self, count: int) -> bytes:
+        """Return the first records."""
+        return self._view[: count * RECORD_SIZE].tobytes()
+
+
+_MESSAGE_SIZE = ctypes.sizeof(_Message)
+_FLAGS_OFFSET = _Message.header.offset + _MessageHeader.flags.offset
+
+
+def _raise_errno() -> None:
+    """Raise what the last call left in errno; an interrupted call returns, to be made again."""
+    number = ctypes.get_errno()
+    if number != errno.EINTR:
+        raise OSError(number, os.strerror(number))
 
 
 def _open(channel: str) -> can.interfaces.socketcan.SocketcanBus:

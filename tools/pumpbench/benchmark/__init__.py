@@ -1,0 +1,1 @@
+"""The speed figures, each beside the fastest this machine can do."""
