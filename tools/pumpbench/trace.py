@@ -74,6 +74,11 @@ class Signal:
             values[np.isin(raw, self.invalid)] = np.nan
         return values
 
+    def text(self, raw: int) -> str:
+        """A raw value in physical units, with the unit and no more digits than the scale has."""
+        value = f"{raw * self.scale + self.offset:.10g}"
+        return f"{value} {self.unit}" if self.unit else value
+
     def label(self, code: float) -> str:
         """The name of a value of an enumeration, or the number as text; "" for NaN."""
         return "" if math.isnan(code) else self.choices.get(int(code), f"{code:g}")
@@ -245,6 +250,17 @@ class Trace:
         column = self.columns.get(name)
         return np.full(len(self), np.nan) if column is None else column
 
+    def basal_delivered(self, drug: str) -> Array:
+        """Rate the pump delivered besides boluses, as a mean over each step.
+
+        Args:
+            drug: "Insulin" (result in U/h) or "Pram" (ug/h).
+        """
+        bolus = self.get(f"{drug}BolusDelivered")
+        rest = self.get(f"{drug}Delivered") - np.where(np.isnan(bolus), 0.0, bolus)
+        rate: Array = np.round(np.maximum(rest, 0.0) * 3600 / STEP_SECONDS, 6)
+        return rate
+
     @classmethod
     def from_frames(cls, frames: Frames, info: Mapping[str, Any] | None = None) -> Trace:
         """Decode a record.
@@ -255,6 +271,7 @@ class Trace:
         """
         builder = _Builder(frames)
         builder.signals()
+        builder.rates()
         builder.doses()
         return cls(
             columns=builder.columns,
@@ -450,6 +467,23 @@ class _Builder:
                 )
             asked = self.commanded(commands, hormone, bolus)
             self.add(f"{short}BolusCommanded", asked, unit, f"{hormone} boluses committed in this step, each id once")
+
+    def rates(self) -> None:
+        """The rates in words of the pump: what a suspension or a return to the schedule means in U/h and ug/h."""
+        operation = self.columns.get("BasalOp")
+        if operation is None:
+            return
+        resume, suspend = (codec.choice("PUMP_BasalCmd", "BasalOp", name) for name in ("ResumeSchedule", "Suspend"))
+        stored = self.columns.get("CfgBasal", np.full(1, np.nan))
+        schedule = stored[~np.isnan(stored)][-1:]
+        for name, signal, resting, unit in (
+            ("InsulinRateCommanded", "InsulinRate", float(schedule[0]) if len(schedule) else math.nan, "U/h"),
+            ("PramRateCommanded", "PramlintideRate", 0.0, "ug/h"),
+        ):
+            rate = self.columns.get(signal, np.full(len(self.steps), np.nan)).copy()
+            rate[operation == suspend] = 0.0
+            rate[operation == resume] = resting
+            self.add(name, rate, unit, "Rate asked for: a suspension is 0, a return to the schedule the stored basal")
 
     def commanded(self, commands: Decoded, hormone: str, signal_name: str) -> Array:
         result = np.zeros(len(self.steps))
