@@ -15,6 +15,7 @@ from can_bus.hilbus import HilBus
 from can_bus.hub_link import HubLink
 from can_bus.inproc import InprocLink, inproc_hub
 from can_bus.link import Link
+from can_bus.slcan import SlcanLink
 from can_bus.socketcan import SocketcanLink
 
 __all__ = ["BusUrlError", "open_bus", "open_link"]
@@ -65,6 +66,8 @@ def open_link(url: str, *, filters: Iterable[int] | None = None, wait: float = 0
     if scheme == "socketcan":
         _, settings = _python_can(url)
         return SocketcanLink(settings["channel"], filters=filters)
+    if scheme == "slcan":
+        return SlcanLink(open_bus(url), url, filters=filters)
     return PythonCanLink(open_bus(url), url, filters=filters)
 
 
