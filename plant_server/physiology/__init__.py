@@ -8,9 +8,10 @@ from .parameters import PARAMETERS, Parameter
 from .patients import PHYSIOLOGIES, Patient, PatientError, cohort, load_patient, pramlintide_sets
 from .pramlintide import eta, plasma_pramlintide
 from .states import STATES, State
-from .variability import SOURCES, MealFactors, Variability
+from .variability import NOMINAL, SOURCES, MealFactors, Variability
 
 __all__ = [
+    "NOMINAL",
     "PARAMETERS",
     "PHYSIOLOGIES",
     "SOURCES",

@@ -10,6 +10,9 @@ from . import parameters as par
 from . import states as st
 from .compiled import READS, WRITES, Array, compiled, entry_point, float64, void
 
+#: mg; less is no meal (and α of a meal of 1e-320 mg would be infinite)
+LEAST_MEAL = 1e-9
+
 
 @compiled
 def k_empt(q_sto: float, meal: float, k_max: float, k_min: float, b: float, c: float) -> float:
@@ -19,13 +22,21 @@ def k_empt(q_sto: float, meal: float, k_max: float, k_min: float, b: float, c: f
     α = 5/(2D(1-b)), β = 5/(2Dc) (Pons Torres 2025, meal model). Written with
     tanh z = 1 - 2/(1 + exp 2z), which costs half as much.
     """
-    if meal <= 0.0:
+    if meal < LEAST_MEAL:
         return k_max
     alpha = 5.0 / (2.0 * meal * (1.0 - b))
     beta = 5.0 / (2.0 * meal * c)
     slowing = 1.0 / (1.0 + math.exp(2.0 * alpha * (q_sto - b * meal)))
     recovery = 1.0 / (1.0 + math.exp(2.0 * beta * (q_sto - c * meal)))
     return k_min + (k_max - k_min) * (1.0 - slowing + recovery)
+
+
+@compiled
+def steepness(meal: float, b: float, c: float) -> float:
+    """The greater of α and β, 1/mg: how fast k_empt switches as the stomach fills."""
+    if meal < LEAST_MEAL:
+        return 0.0
+    return 5.0 / (2.0 * meal * min(1.0 - b, c))
 
 
 #: mg; the small-meal rule treats a meal below this size as one of this size, else its rate would know no bound
@@ -35,7 +46,7 @@ SMALLEST_MEAL = 1000.0
 @compiled
 def small_meal_factor(meal: float, limit: float) -> float:
     """Emptying of meals below `limit` mg is limit/D times faster (T1DMS, undocumented; LoopInsighT1, MIT)."""
-    if meal <= 0.0 or meal >= limit:
+    if meal < LEAST_MEAL or meal >= limit:
         return 1.0
     return limit / max(meal, SMALLEST_MEAL)
 
@@ -70,6 +81,8 @@ def begin_meal(x: Array, p: Array, carbs_mg: float) -> None:
 
     The food itself arrives through `advance`, as it is eaten.
     """
+    if not 0.0 <= carbs_mg < math.inf:
+        raise ValueError("a meal has zero or more mg of carbohydrate")
     x[st.D] = x[st.Q_STO1] + x[st.Q_STO2] + carbs_mg
 
 

@@ -12,7 +12,7 @@ from . import parameters as par
 from . import states as st
 from .compiled import READS, WRITES, Array, compiled, entry_point, float64, void
 from .counter_regulation import counter_regulation_derivatives, glucagon_production, insulin_action_gain
-from .gastric import gastric_derivatives, small_meal_factor
+from .gastric import gastric_derivatives, small_meal_factor, steepness
 from .glucose import glucose_derivatives
 from .insulin import PMOL_PER_U, insulin_derivatives
 from .pramlintide import PMOL_PER_UG, pramlintide_derivatives, slowing
@@ -23,6 +23,15 @@ MINUTES_PER_DAY = 1440.0
 #: Masses below this many of their units become zero: they change no digit of anything, but arithmetic on numbers
 #: below 1e-308 is a hundred times slower.
 VANISHED = 1e-200
+
+#: most that can arrive within one step: far above anything a pump or a mouth can do, far below any overflow
+MOST_INSULIN_U = 100.0
+MOST_PRAMLINTIDE_UG = 1e5
+MOST_CARBS_MG = 1e6
+
+#: change in the argument of k_empt's tanh that one part of a step may hold, and where refining ends
+SWITCHING_PER_PART = 1.0
+MOST_PARTS_FOR_ACCURACY = 8.0
 
 _STATES = len(st.STATES)
 _PARAMETERS = len(par.PARAMETERS)
@@ -68,17 +77,21 @@ def derivatives(
 
 
 @compiled
-def parts_of_step(x: Array, p: Array, h: float) -> int:
-    """How many equal parts a step needs to stay stable: one, in every state that a patient can be in.
+def parts_of_step(x: Array, p: Array, h: float, eating: float) -> int:
+    """How many equal parts a step is integrated in: one, but for three short or absurd occasions.
 
-    Only two rates can leave the range that the step was chosen for: tissue uptake under an absurd amount of insulin,
-    and the emptying of very small meals.
+    For accuracy: while a steep patient bolts a meal, the rate of emptying switches within a step. For stability:
+    tissue uptake under an absurd amount of insulin, and the emptying of very small meals.
     """
     action = x[st.X] + h * p[par.P2U] * (x[st.IP] / p[par.VI])  # at the end of the step
     gain = insulin_action_gain(x, p) if p[par.S2013] != 0.0 else 1.0
     uptake = p[par.K2] + (p[par.VM0] + 2.0 * p[par.VMX] * gain * max(0.0, action)) / p[par.KM0]
     emptying = p[par.K_MAX] * small_meal_factor(x[st.D], p[par.SMALL_MEAL])
-    return 1 + int(h * max(uptake, emptying))
+    parts = 1 + int(h * max(uptake, emptying))
+    if eating > 0.0:
+        switching = eating * steepness(x[st.D], p[par.B], p[par.C])
+        parts = max(parts, 1 + int(min(h * switching / SWITCHING_PER_PART, MOST_PARTS_FOR_ACCURACY - 1.0)))
+    return parts
 
 
 @entry_point(void, WRITES, READS, float64, float64, READS, READS, READS)
@@ -90,6 +103,13 @@ def runge_kutta(
         raise ValueError("the state or the parameter vector has a wrong length")
     if pramlintide_ug.size != insulin_u.size or carbs_mg.size != insulin_u.size:
         raise ValueError("insulin, pramlintide and carbohydrate differ in their number of steps")
+    for step in range(insulin_u.size):
+        if not (
+            0.0 <= insulin_u[step] <= MOST_INSULIN_U
+            and 0.0 <= pramlintide_ug[step] <= MOST_PRAMLINTIDE_UG
+            and 0.0 <= carbs_mg[step] <= MOST_CARBS_MG
+        ):
+            raise ValueError("an amount is negative, not a number, or beyond 100 U, 100 mg or 1 kg in one step")
     y = x.copy()
     k1 = np.empty_like(x)
     k2 = np.empty_like(x)
@@ -101,7 +121,7 @@ def runge_kutta(
         pramlintide = pramlintide_ug[step] / step_min * PMOL_PER_UG
         eating = carbs_mg[step] / step_min
 
-        parts = parts_of_step(x, p, step_min)
+        parts = parts_of_step(x, p, step_min, eating)
         h = step_min / parts
         for part in range(parts):
             t = t_min + step * step_min + part * h
@@ -141,5 +161,9 @@ def advance(x: Array, p: Array, t_min: float, insulin_u: Array, pramlintide_ug: 
         insulin_u: insulin delivered within each step, U; spread evenly over it.
         pramlintide_ug: pramlintide delivered within each step, µg.
         carbs_mg: carbohydrate eaten within each step, mg.
+
+    Raises:
+        ValueError: for an amount that is negative, not a number or absurd, before anything has changed, and for
+            arrays of the wrong length.
     """
     runge_kutta(x, p, t_min, STEP_MIN, insulin_u, pramlintide_ug, carbs_mg)

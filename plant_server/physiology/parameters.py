@@ -16,6 +16,8 @@ _PAPER = "Pons Torres 2025, variability"
 #: source of what a patient file must hold
 COHORT = "simglucose 0.2.11 (MIT), adult cohort"
 _S2013 = "Dalla Man 2014; value LoopInsighT1 (MIT) default"
+_T1DMS = "T1DMS, undocumented; LoopInsighT1 (MIT)"
+_RISK = "Dalla Man 2014; population value, also in ReplayBG"
 _PRAMLINTIDE = "Pons Torres 2025, table of parameters; value in data/pramlintide.csv"
 
 PARAMETERS = (
@@ -27,7 +29,7 @@ PARAMETERS = (
     Parameter("b", "-", "share of the meal left where emptying has slowed halfway", COHORT),
     Parameter("c", "-", "share of the meal left where emptying is halfway back (`d` in simglucose)", COHORT),
     Parameter("f", "-", "share of absorbed glucose that reaches plasma", COHORT),
-    Parameter("small_meal", "mg", "meals below this size empty faster, 30 g in S2013; 0 = rule off", "T1DMS"),
+    Parameter("small_meal", "mg", "meals below this size empty faster, 30 g in S2013; 0 = rule off", _T1DMS),
     # glucose
     Parameter("Vg", "dL/kg", "distribution volume of glucose", COHORT),
     Parameter("k1", "1/min", "transfer of glucose from plasma to tissue", COHORT),
@@ -69,9 +71,9 @@ PARAMETERS = (
     Parameter("S2013", "-", "1 = counter-regulation on, 0 = S2008 equations", "Dalla Man 2014"),
     Parameter("Gth", "mg/dL", "glucose below which counter-regulation starts", "Dalla Man 2014"),
     Parameter("Ith", "pmol/L", "insulin above which glucagon secretion is inhibited", "Dalla Man 2014"),
-    Parameter("r1", "-", "exponent of the risk function", _S2013),
+    Parameter("r1", "-", "exponent of the risk function", _RISK),
     Parameter("r2", "-", "ln(Gth)^r1, so that the risk is zero at Gth", "Dalla Man 2014"),
-    Parameter("r3", "-", "gain of the risk on insulin action", _S2013),
+    Parameter("r3", "-", "gain of the risk on insulin action", _RISK),
     Parameter("kcounter", "mg/kg/min per ng/L", "effect of glucagon on glucose production", _S2013),
     Parameter("kXGn", "1/min", "rate of glucagon action", _S2013),
     Parameter("k01g", "1/min", "clearance of glucagon", _S2013),
