@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from e2e.p02 import e2e_p02_check, e2e_p02_protect
 
 import dbc
-from can_bus.frame import Frame
+from can_bus.frame import CAN_EFF_MASK, CAN_ERR_FLAG, Frame
 
 COUNTER_MODULUS = 16
 
@@ -77,18 +77,23 @@ class MessageCodec:
         self.selector: str | None = None
         common: list[Field] = []
         pages: dict[int, list[Field]] = {}
+        self._page_of: dict[str, int] = {}
+        self._page_start: dict[str, int] = {}
         initial = 0
         for signal in message.signals:
             if signal.name in hidden:
                 continue
             field = _field(signal)
             self.fields[signal.name] = field
-            start = signal.dbc.attributes.get("GenSigStartValue")
+            attribute = signal.dbc.attributes.get("GenSigStartValue")
+            start = ((int(attribute.value) if attribute else 0) & field.mask) << field.shift
             if signal.multiplexer_ids:
                 pages.setdefault(signal.multiplexer_ids[0], []).append(field)
+                self._page_of[field.name] = signal.multiplexer_ids[0]
+                self._page_start[field.name] = start
             else:
                 common.append(field)
-                initial |= ((int(start.value) if start else 0) & field.mask) << field.shift
+                initial |= start
             if signal.is_multiplexer:
                 self.selector = signal.name
         self._initial = initial
@@ -101,7 +106,8 @@ class MessageCodec:
         """The payload as an integer, CHECKSUM and COUNTER zero; signals left out keep their start value.
 
         Raises:
-            CodecError: an unknown signal, or a value neither in the signal's range nor one of its named codes.
+            CodecError: an unknown signal, one of another page than the selector's, or a value neither in the signal's
+                range nor one of its named codes.
         """
         names = tuple(values)
         plan = self._plans.get(names)
@@ -112,6 +118,17 @@ class MessageCodec:
             if not low <= value <= high and value not in self.fields[name].reserved:
                 raise CodecError(f"{self.name}.{name}: raw value {value} is outside {low}..{high}")
             word |= (value & mask) << shift
+        return word if self.selector is None else self._turn_page(self.selector, word, values)
+
+    def _turn_page(self, selector: str, word: int, values: Mapping[str, int]) -> int:
+        """Check that the values belong to the selected page, and add the start values of what was left out of it."""
+        page = word >> self.fields[selector].shift & self.fields[selector].mask
+        for name in values:
+            if self._page_of.get(name, page) != page:
+                raise CodecError(f"{self.name}.{name} does not exist when {selector} is {page}")
+        for field in self.pages.get(page, ()):
+            if field.name not in values:
+                word |= self._page_start[field.name]
         return word
 
     def _plan(self, names: tuple[str, ...]) -> tuple[int, tuple[tuple[int, int, int, int], ...]]:
@@ -209,9 +226,10 @@ class Transmitter:
             codec = self._codecs[name]
         except KeyError:
             codec = message(name)
+        word = codec.pack(values)  # a refused value does not use up a count
         counter = self._counters[name]
         self._counters[name] = (counter + 1) % COUNTER_MODULUS
-        return Frame(codec.can_id, protect(codec, codec.pack(values), counter))
+        return Frame(codec.can_id, protect(codec, word, counter))
 
 
 class Check(enum.IntEnum):
@@ -222,8 +240,8 @@ class Check(enum.IntEnum):
     REPEATED = 2  # the counter of the last good frame again
     WRONG_SEQUENCE = 3  # more than MAX_LOST frames are missing: not to be used
     ERROR = 4  # the CRC does not fit: as if never received
-    MALFORMED = 5  # remote, error or 29-bit frame, or a wrong length
-    UNKNOWN = 6  # an id this receiver does not subscribe to
+    MALFORMED = 5  # a remote or 29-bit frame with a subscribed id, or a wrong length
+    UNKNOWN = 6  # an id this receiver does not subscribe to, or an error frame: no node sent it
 
 
 class Received(NamedTuple):
@@ -296,8 +314,8 @@ class Receiver:
         return Received(Check.OK_SOME_LOST, codec.name, codec.unpack(data), step - 1)
 
     def _foreign(self, can_id: int) -> Received:
-        standard = can_id & 0x7FF
-        if can_id != standard and standard in self._codecs:  # RTR, error or 29-bit frame dressed as one of ours
-            self.malformed += 1
-            return Received(Check.MALFORMED, self._codecs[standard].name, {}, 0)
-        return Received(Check.UNKNOWN, "", {}, 0)
+        codec = self._codecs.get(can_id & CAN_EFF_MASK)
+        if codec is None or can_id & CAN_ERR_FLAG:  # the id of an error frame is a class of errors, not an id
+            return Received(Check.UNKNOWN, "", {}, 0)
+        self.malformed += 1
+        return Received(Check.MALFORMED, codec.name, {}, 0)

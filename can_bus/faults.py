@@ -36,11 +36,13 @@ def seconds(text: Any) -> int:
     return days * 86400 + hours * 3600 + minutes * 60 + rest
 
 
-def _known_message(name: str) -> str:
-    if name not in codec.messages():
-        near = difflib.get_close_matches(name, codec.messages(), 3) or list(codec.messages())
-        raise ValueError(f"the DBC has no message {name!r}; did you mean {' or '.join(near)}?")
-    return name
+def _known_message(name: Any) -> str:
+    known = list(codec.messages())
+    if isinstance(name, str) and name in known:
+        return name
+    near = difflib.get_close_matches(name, known, 3) if isinstance(name, str) else []
+    hint = f"did you mean {' or '.join(near)}?" if near else f"it has {', '.join(known)}"
+    raise ValueError(f"the DBC has no message of this name; {hint}")
 
 
 Time = Annotated[int, BeforeValidator(seconds)]

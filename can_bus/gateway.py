@@ -4,7 +4,8 @@ It is a wire with faults: what arrives on one side goes out on the other in the 
 to it. Every injection is itself a frame, FAULT_Inject, on the bus the faulty frame was headed for.
 
 Simulated time is read off the lockstep: what the plant sends after SYNC_Done(k) belongs to instant k+1, although the
-token of that instant comes last. On a device that does not do lockstep, the newest SYNC_Step tells the time.
+token of that instant comes last. On a device that does not do lockstep, the newest SYNC_Step tells the time. The roll
+call passes untouched: faults begin with the calibration.
 """
 
 import argparse
@@ -34,25 +35,51 @@ class Side(enum.IntEnum):
 
 
 class Clock:
-    """Simulated time as the frames tell it."""
+    """Simulated time as the frames tell it.
+
+    Attributes:
+        token_id, done_id: whose frames it wants to see.
+        time: simulated seconds.
+        running: the roll call is over; how often the roll was called depends on the wall clock, so that a fault must
+            not act on it.
+        ended: the device has answered the last token.
+    """
 
     def __init__(self) -> None:
         self.time = 0
-        self._step_message = codec.message("SYNC_Step")
-        self._done_message = codec.message("SYNC_Done")
-        self._phase = Phase.INIT
+        self.running = False
+        self.ended = False
+        self._token = codec.message("SYNC_Step")
+        self._done = codec.message("SYNC_Done")
+        self.token_id, self.done_id = self._token.can_id, self._done.can_id
+        self._phase: int = Phase.INIT
+        self._step = -1
 
-    def watch(self, frame: Frame) -> None:
-        """Look at a frame in passing."""
-        if frame.can_id == self._step_message.can_id and len(frame.data) == self._step_message.length:
-            values = self._step_message.unpack(frame.data)
-            self._phase = Phase(values["SyncPhase"]) if values["SyncPhase"] in set(Phase) else Phase.STEP
-            if self._phase == Phase.STEP:
-                self.time = values["StepIndex"] * STEP_SECONDS
-        elif frame.can_id == self._done_message.can_id and len(frame.data) == self._done_message.length:
-            values = self._done_message.unpack(frame.data)
-            if self._phase in (Phase.STEP, Phase.CONTINUE) and values["DoneStatus"] != Done.CONTINUE:
-                self.time = (values["DoneStepIndex"] + 1) * STEP_SECONDS
+    def token(self, frame: Frame) -> None:
+        """The plant gives the turn, whether the device gets to know or not."""
+        if len(frame.data) != self._token.length:
+            return
+        values = self._token.unpack(frame.data)
+        self._phase, self._step = values["SyncPhase"], values["StepIndex"]
+        self.running = self._phase != Phase.INIT
+        if self._phase == Phase.INIT:
+            self.time = 0
+        elif self._phase == Phase.STEP:
+            self.time = self._step * STEP_SECONDS
+
+    def done(self, frame: Frame) -> None:
+        """The plant hears that the device's turn is over; what does not answer its token is ignored there too."""
+        if len(frame.data) != self._done.length:
+            return
+        values = self._done.unpack(frame.data)
+        if values["DoneStepIndex"] != self._step:
+            return
+        if self._phase == Phase.INIT:
+            self.running = True
+        elif self._phase == Phase.END:
+            self.ended = True
+        elif self._phase in (Phase.STEP, Phase.CONTINUE) and values["DoneStatus"] != Done.CONTINUE:
+            self.time = (self._step + 1) * STEP_SECONDS
 
 
 class Gateway:
@@ -61,19 +88,20 @@ class Gateway:
     def __init__(self, faults: tuple[Fault, ...] = ()) -> None:
         self._injector = Injector(faults)
         self._clock = Clock()
-        self.finished = False
-        self._step_id = codec.message("SYNC_Step").can_id
-        self._done_id = codec.message("SYNC_Done").can_id
-        self._ending = False
+
+    @property
+    def finished(self) -> bool:
+        """True when the end of the run has been passed on."""
+        return self._clock.ended
 
     def forward(self, frame: Frame) -> list[Frame]:
         """What the other side gets for this frame."""
-        passed, reports = self._injector.apply(frame, self._clock.time)
-        self._clock.watch(frame)
-        if frame.can_id == self._step_id and len(frame.data) == 8:
-            self._ending = codec.message("SYNC_Step").unpack(frame.data)["SyncPhase"] == Phase.END
-        elif frame.can_id == self._done_id and self._ending:
-            self.finished = True
+        clock = self._clock
+        passed, reports = self._injector.apply(frame, clock.time) if clock.running else ([frame], [])
+        if frame.can_id == clock.token_id:
+            clock.token(frame)
+        elif frame.can_id == clock.done_id and frame in passed:
+            clock.done(frame)
         return reports + passed
 
 

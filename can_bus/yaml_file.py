@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -22,24 +22,78 @@ def load(path: Path, model: type[Model]) -> Model:
     """
     try:
         text = path.read_text(encoding="utf-8")
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        content = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot read {path}: {error}") from error
-    except yaml.YAMLError as error:
-        raise FileError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2026-99-99
+        raise FileError(_not_yaml(path, error)) from error
+    _refuse_repeated_keys(path, root)
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise FileError("; ".join(_problem(path, root, problem) for problem in error.errors()[:3])) from error
+        raise FileError("; ".join(_problem(path, root, model, problem) for problem in error.errors()[:3])) from error
 
 
-def _problem(path: Path, root: yaml.Node | None, problem: object) -> str:
+def _not_yaml(path: Path, error: Exception) -> str:
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"{path}:{error.problem_mark.line + 1}: not YAML: {error.problem}"
+    return f"{path}: not YAML: {' '.join(str(error).split())}"
+
+
+def _refuse_repeated_keys(path: Path, root: yaml.Node | None) -> None:
+    """YAML forbids them, PyYAML silently takes the last one."""
+    nodes, known = [root], set()  # an alias leads to a node again, even to one around it
+    while nodes:
+        node = nodes.pop()
+        if id(node) in known:
+            continue
+        known.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            nodes += node.value
+        elif isinstance(node, yaml.MappingNode):
+            keys = set()
+            for key, value in node.value:
+                if key.value in keys:
+                    raise FileError(f"{path}:{key.start_mark.line + 1}: the key {key.value} stands there twice")
+                keys.add(key.value)
+                nodes.append(value)
+
+
+def _problem(path: Path, root: yaml.Node | None, model: type[BaseModel], problem: object) -> str:
     assert isinstance(problem, dict)
-    place = ".".join(str(part) for part in problem["loc"]) or "top level"
+    location = problem["loc"]
+    place = ".".join(str(part) for part in location) or "top level"
     found = problem.get("input")
     shown = "" if isinstance(found, dict | list) or found is None else f" (found {found!r})"
-    return f"{path}:{_line(root, problem['loc'])}: {place}: {problem['msg']}{shown}"
+    text = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "extra_forbidden":
+        text, shown = f"unknown key; expected one of {', '.join(_keys(model, location))}", ""
+    elif problem["type"] == "missing":
+        text = "this key is missing"
+    elif problem["type"] == "model_type":
+        text = f"expected a mapping with the keys {', '.join(_keys(model, (*location, '')))}"
+    return f"{path}:{_line(root, location)}: {place}: {text}{shown}"
+
+
+def _keys(model: type[BaseModel], location: Sequence[object]) -> list[str]:
+    """The keys that may stand beside the last part of `location`."""
+    models = [model]
+    for part in location[:-1]:
+        fields = [each.model_fields[part] for each in models if isinstance(part, str) and part in each.model_fields]
+        if fields:
+            models = [found for field in fields for found in _models(field.annotation)]
+        elif isinstance(part, str):  # a pydantic union puts the chosen kind into the location
+            kinds = [each for each in models if any(field.default == part for field in each.model_fields.values())]
+            models = kinds or models
+    return list(dict.fromkeys(key for each in models for key in each.model_fields))
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for argument in get_args(annotation) for found in _models(argument)]
 
 
 def _line(node: yaml.Node | None, location: Sequence[object]) -> int:
