@@ -21,7 +21,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # a usage error is a line, not a box
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-console = Console(highlight=False)
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 

@@ -61,13 +61,15 @@ def listen(links: Sequence[Link], capture: Capture) -> bool:
     by_descriptor = {link.fileno(): channel for channel, link in enumerate(links)}
     lossless = all(link.url.startswith(("unix:", "tcp:", "inproc:")) for link in links)
     try:
-        while not all(ending.over for ending in endings):
+        while by_descriptor:
             ready, _, _ = select.select(list(by_descriptor), [], [])
             for descriptor in ready:
                 channel = by_descriptor[descriptor]
                 frames = links[channel].recv(0)
                 capture.extend(channel, frames)
                 endings[channel].watch(frames)
+                if endings[channel].over:  # this bus may be closed now while the other one still talks
+                    del by_descriptor[descriptor]
             if lossless:
                 time.sleep(COALESCE_SECONDS)
     except _Stop:
