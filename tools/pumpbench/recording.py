@@ -13,6 +13,7 @@ import json
 import os
 import subprocess
 import tempfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,6 +84,9 @@ LANES: Final[tuple[tuple[str, str, str], ...]] = (
     ("CtrlMode", "CTRL_Status", "strategy"),
 )
 """State lanes: signal, message, what a reader calls it."""
+
+
+GLUCOSE: Final = ("TruthGlucose", "GlucoseConc")
 
 
 class RecordingError(RuntimeError):
@@ -388,13 +392,16 @@ def _hue(name: str) -> tuple[int, int, int]:
 # --------------------------------------------------------------------------------------------------------- how it looks
 
 
-def blueprint(start_s: float, end_s: float, *, gateway: bool = False, bus_top: float = 50.0) -> Any:
+def blueprint(
+    start_s: float, end_s: float, *, gateway: bool = False, bus_top: float = 50.0, glucose_top: float = 320.0
+) -> Any:
     """The layout of a recording as a `rerun.blueprint.Blueprint`, with all time axes linked.
 
     Args:
         start_s, end_s: simulated seconds the axes show at first.
         gateway: whether a second bus, the plant's, was recorded.
         bus_top: upper end of the axis of frames per step.
+        glucose_top: upper end of the axis of glucose, mg/dL; the same for all runs that stay below it, to compare them.
     """
     import rerun as rr  # noqa: PLC0415
     import rerun.blueprint as rrb  # noqa: PLC0415
@@ -421,14 +428,14 @@ def blueprint(start_s: float, end_s: float, *, gateway: bool = False, bus_top: f
         )
 
     left = rrb.Vertical(
-        plot("Glucose [mg/dL]", ["glucose/**", "limits/**"], (40, 320)),
+        plot("Glucose [mg/dL]", ["glucose/**", "limits/**"], (40, glucose_top)),
         plot("Insulin: commanded against delivered", ["insulin/**"]),
         plot("Pramlintide: commanded against delivered", ["pramlintide/**"]),
         plot("Stomach", ["stomach/**"]),
         rrb.StateTimelineView(
             name="States and injected faults", contents=["+ /state/**", "+ /fault/**"], time_view=axis
         ),
-        row_shares=[3.6, 2.6, 2.6, 2.2, 3.3],
+        row_shares=[3.6, 2.6, 2.6, 2.1, 3.6],
     )
     log_columns = rrb.TextLogColumns(
         timeline_columns=[rrb.components.TimelineColumn(TIMELINE, visible=False)], text_log_columns=["loglevel", "body"]
@@ -442,10 +449,13 @@ def blueprint(start_s: float, end_s: float, *, gateway: bool = False, bus_top: f
     tables.append(rrb.DataframeView(name="Raw", origin="/can/can0"))
     right = rrb.Vertical(
         rrb.TextLogView(name="Alarms, faults, meals, states", origin="/log", columns=log_columns),
-        plot("Bus: frames per step, and what the firmware counts", ["bus/**"], (0, bus_top)),
-        plot("Plasma levels, insulin on board", ["body/**"]),
+        rrb.Tabs(
+            plot("Bus: frames per step, firmware's counters", ["bus/**"], (0, bus_top)),
+            plot("Plasma levels, insulin on board", ["body/**"]),
+            active_tab=0,
+        ),
         rrb.Tabs(*tables, rrb.TextDocumentView(name="Run", origin="/run"), active_tab=0),
-        row_shares=[4, 2.5, 2.5, 3],
+        row_shares=[4, 3.5, 4],
     )
     return _linked(rrb, rr)(
         rrb.Horizontal(left, right, column_shares=[64, 36]),
@@ -527,10 +537,13 @@ def write_recording(trace: Trace, frames: Frames, path: Path, metrics: Mapping[s
         0.0 if not len(trace) else float(trace.time_s[0]),
         max(end_s, STEP_SECONDS),
         gateway=bool(np.any(frames.channel == 1)),
-        bus_top=2.5 * _usual_frames(frames),
+        bus_top=3.0 * _usual_frames(frames),
+        glucose_top=max(320.0, *(np.nanmax(np.append(trace.get(name), 0.0)) + 20 for name in GLUCOSE)),
     )
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".recording-") as directory:
         raw, final = Path(directory) / "raw.rrd", Path(directory) / "recording.rrd"
+        strict = rr.strict_mode()
+        rr.set_strict_mode(True)  # else a value Rerun does not like is only a warning, and missing
         try:
             with rr.RecordingStream(APPLICATION, recording_id=_recording_id(trace, frames)) as recording:
                 recording.save(raw, default_blueprint=layout)
@@ -538,8 +551,10 @@ def write_recording(trace: Trace, frames: Frames, path: Path, metrics: Mapping[s
                 recording.send_recording_name(title(trace.info))
                 log_run(recording, trace, frames, metrics)
                 recording.flush(timeout_sec=60)
-        except RuntimeError as error:
+        except (RuntimeError, TypeError, ValueError) as error:
             raise RecordingError(f"Rerun could not write {path.name}: {error}") from error
+        finally:
+            rr.set_strict_mode(strict)
         environment = quiet_environment(Path(directory))
         _rrd(["optimize", str(raw), "-o", str(final)], environment)
         _rrd(["verify", str(final)], environment)
@@ -552,7 +567,9 @@ def _usual_frames(frames: Frames) -> float:
 
 
 def _recording_id(trace: Trace, frames: Frames) -> str:
-    return str(trace.info.get("trace_sha256") or frames.sha256())[:32]
+    """The same run gets the same id; the viewer joins recordings of one id, so whatever differs must show in it."""
+    about = zlib.crc32(json.dumps(trace.info, sort_keys=True, default=str).encode())
+    return f"{frames.sha256()[:24]}-{about:08x}"
 
 
 def _rrd(arguments: list[str], environment: dict[str, str]) -> None:

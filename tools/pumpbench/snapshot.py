@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from pumpbench.recording import quiet_environment, rerun_binary
+from pumpbench.recording import APPLICATION, TIMELINE, blueprint, quiet_environment, rerun_binary
 from pumpbench.summary import write_summary
 from pumpbench.trace import Trace
 
@@ -31,6 +31,7 @@ def snapshot(
     *,
     size: tuple[int, int] = (1600, 1000),
     view: str | None = None,
+    window: tuple[float, float] | None = None,
     timeout: float = 60,
 ) -> str:
     """Draw a recording into a PNG.
@@ -38,12 +39,13 @@ def snapshot(
     Args:
         rrd_path: the recording; for the fallback its folder also holds the trace.
         png_path: the picture; overwritten.
-        size: width and height in logical points; the viewer's picture has twice as many pixels.
+        size: width and height of the viewer's window in pixels.
         view: name of one view to draw instead of the whole window.
+        window: simulated seconds from, to; the whole run when left out.
         timeout: seconds of wall clock for the viewer.
 
     Returns:
-        How it was drawn, in words.
+        How it was drawn, in words, and what the viewer could not show.
 
     Raises:
         FileNotFoundError: no such recording, or neither a viewer nor a trace to draw from.
@@ -52,22 +54,35 @@ def snapshot(
     if not rrd_path.is_file():
         raise FileNotFoundError(f"{rrd_path} is missing")
     try:
-        _draw(rrd_path.resolve(), png_path.resolve(), size, view, timeout)
+        complaints = _draw(rrd_path.resolve(), png_path.resolve(), size, view, window, timeout)
     except NoViewer as error:
-        write_summary(Trace.load(rrd_path.parent), png_path)
+        trace = Trace.load(rrd_path.parent)
+        write_summary(trace if window is None else trace.between(*window), png_path)
         return f"drawn by Matplotlib, because Rerun's viewer cannot draw here: {error}"
-    return "drawn by Rerun's viewer, off-screen"
+    return "; ".join(["drawn by Rerun's viewer, off-screen", *complaints])
 
 
-def _draw(rrd: Path, png: Path, size: tuple[int, int], view: str | None, timeout: float) -> None:
+def _draw(
+    rrd: Path,
+    png: Path,
+    size: tuple[int, int],
+    view: str | None,
+    window: tuple[float, float] | None,
+    timeout: float,
+) -> list[str]:
     deadline = time.monotonic() + timeout
     port = _free_port()
     with tempfile.TemporaryDirectory() as scratch:
         arguments = ["--headless", "--port", str(port), "--bind", "127.0.0.1", "--memory-limit", "2GB"]
+        files = [str(rrd)]
+        if window is not None:
+            layout = Path(scratch) / "window.rbl"
+            blueprint(*window, gateway=True).save(APPLICATION, layout)
+            files.append(str(layout))
         errors = Path(scratch) / "stderr"
         with errors.open("wb") as sink:
             viewer = subprocess.Popen(
-                [rerun_binary(), *arguments, "--window-size", f"{size[0]}x{size[1]}", str(rrd)],
+                [rerun_binary(), *arguments, "--window-size", f"{size[0]}x{size[1]}", *files],
                 env=quiet_environment(Path(scratch)),
                 stdout=subprocess.DEVNULL,
                 stderr=sink,
@@ -80,9 +95,13 @@ def _draw(rrd: Path, png: Path, size: tuple[int, int], view: str | None, timeout
                 chosen = next((shown.view_id for shown in state.views if shown.name == view), None)
                 if chosen is None:
                     raise ValueError(f"no view {view!r}; there are {', '.join(shown.name for shown in state.views)}")
+            if window is not None:
+                client.set_time(TIMELINE, duration=window[0])  # the tables scroll there
             time.sleep(SETTLE_SECONDS)
             try:
                 png.write_bytes(client.take_screenshot(chosen))
+                views = client.get_state().views
+                return [f"view {shown.name}: {report.summary}" for shown in views for report in shown.reports]
             except (RuntimeError, ConnectionError) as error:
                 raise NoViewer(f"it took no screenshot: {error}") from error
         finally:

@@ -67,6 +67,8 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
+    dry = not any(np.nan_to_num(trace.get(name)).any() for name in ("PramRateCommanded", "PramDelivered"))
+    dry = dry and not trace.get("PramBolusCommanded").any()
     lanes = _lanes(trace)
     lines = _alarm_lines(trace)
     rows = (len(lines) + 2) // 3
@@ -74,9 +76,8 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
     figure = Figure(figsize=(16, 10), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     rest = 10 - 1.25 - lane_height - text_height
-    axes = figure.subplots(
-        4, 1, sharex=True, height_ratios=[0.44 * rest, 0.3 * rest, 0.26 * rest, lane_height]
-    ).tolist()
+    shares = [0.55 * rest, 0.40 * rest, 0.05 * rest] if dry else [0.44 * rest, 0.30 * rest, 0.26 * rest]
+    axes = figure.subplots(4, 1, sharex=True, height_ratios=[*shares, lane_height]).tolist()
     figure.subplots_adjust(left=0.062, right=0.838, top=0.925, bottom=(0.45 + text_height) / 10, hspace=0.09)
     figure.text(0.06, 0.965, title(trace.info), fontsize=16, fontweight="bold", va="center")
     figure.text(0.06, 0.94, _headline(trace, metrics), fontsize=11.5, va="center", color="#444444")
@@ -84,7 +85,11 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
     start_s = float(trace.time_s[0]) if len(trace) else 0.0
     _glucose(axes[0], trace)
     _drug(axes[1], trace, "Insulin", "U", COMMANDED, end_s - start_s)
-    _drug(axes[2], trace, "Pram", "µg", PRAM, end_s - start_s)
+    if dry:
+        axes[2].set_yticks([])
+        axes[2].text(0.5, 0.45, "no pramlintide in this run", transform=axes[2].transAxes, ha="center", va="center")
+    else:
+        _drug(axes[2], trace, "Pram", "µg", PRAM, end_s - start_s)
     _draw_lanes(axes[3], lanes, end_s - start_s)
     for axis in axes[:3]:
         for span in trace.fault_spans():
@@ -254,6 +259,8 @@ def _lanes(trace: Trace) -> list[Lane]:
             names.append((signal, "PUMP_Status", what))
     for signal, message, what in names:
         changes = state_changes(trace, signal, message)
+        if not changes:
+            continue
         ends = [time_s for time_s, _ in changes[1:]] + [end_s]
         colours = STATE_COLOURS[signal]
         bars = [
@@ -294,7 +301,7 @@ def alarm_bars(trace: Trace, end_s: float) -> list[Bar]:
 
 
 def _draw_lanes(axis: Any, lanes: Sequence[Lane], span_s: float) -> None:
-    axis.set_ylim(len(lanes) - 0.45, -0.55)
+    axis.set_ylim(max(len(lanes), 1) - 0.45, -0.55)
     axis.set_yticks(range(len(lanes)), [lane.name for lane in lanes], fontsize=9)
     axis.tick_params(axis="y", length=0)
     for side in ("top", "right", "left"):

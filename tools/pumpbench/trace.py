@@ -14,7 +14,7 @@ import functools
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -283,6 +283,27 @@ class Trace:
             info=dict(info or {}),
             units=builder.units,
             comments=builder.comments,
+        )
+
+    def between(self, start_s: float, end_s: float) -> Trace:
+        """The steps of a stretch of simulated time, with the events that lie in it.
+
+        Alarms that were raised before are part of it as if raised at its start, because they still hold.
+        """
+        rows = (self.time_s >= start_s) & (self.time_s <= end_s)
+        standing: dict[tuple[str, int], AlarmEvent] = {}
+        for alarm in self.alarms:
+            if alarm.time_s < start_s:
+                standing[alarm.node, alarm.instance] = replace(alarm, time_s=start_s)
+        standing = {key: alarm for key, alarm in standing.items() if alarm.state != "Inactive"}
+        return replace(
+            self,
+            columns={name: column[rows] for name, column in self.columns.items()},
+            step=self.step[rows],
+            time_s=self.time_s[rows],
+            alarms=[*standing.values(), *(alarm for alarm in self.alarms if start_s <= alarm.time_s <= end_s)],
+            faults=[fault for fault in self.faults if start_s <= fault.time_s <= end_s],
+            meals=[meal for meal in self.meals if start_s <= meal.time_s <= end_s],
         )
 
     def fault_spans(self) -> list[FaultSpan]:
