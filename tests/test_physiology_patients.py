@@ -182,3 +182,10 @@ def test_every_column_is_documented():
             name = "c" if (file, column) == ("adults.csv", "d") else column
             if name in par.INDEX:
                 assert row["unit"] == par.PARAMETERS[par.INDEX[name]].unit
+
+
+def test_the_page_lists_every_state_and_parameter():
+    page = (Path(__file__).parent.parent / "docs" / "physiology.md").read_text(encoding="utf-8")
+    for record in (*physiology.STATES, *physiology.PARAMETERS):
+        row = f"| `{record.name}` | {record.unit} | {record.description} | {record.source} |"
+        assert row in page

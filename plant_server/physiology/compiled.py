@@ -57,7 +57,10 @@ def entry_point(result: Any, *arguments: Any) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         # Two steps: the cache has to be tied to the package before the signature is compiled or looked up.
-        dispatcher = njit(cache=True, error_model="numpy")(function)
+        try:
+            dispatcher = njit(cache=True, error_model="numpy")(function)
+        except RuntimeError:  # nowhere to write, as in a read-only container
+            dispatcher = njit(error_model="numpy")(function)
         _tie_to_package(dispatcher)
         if hasattr(dispatcher, "compile"):
             dispatcher.compile(result(*arguments))
