@@ -50,6 +50,9 @@ PRIORITY = {
     Code.NODE_RESET: Priority.INFO,
 }
 
+STEPS_AT_LEAST = 6
+"""Steps an alarm lasts however soon its cause ends, so that a flapping cause raises one alarm in 30 min (FAL-03)."""
+
 INSTANCES = 65535
 """Instance numbers run from 0 to 65534; 65535 is SNA."""
 
@@ -60,6 +63,7 @@ class _Alarm:
     state: State
     aux: int
     changed: bool = True
+    steps: int = 0  # reported so far
 
 
 class Alarms:
@@ -70,18 +74,21 @@ class Alarms:
         self._next_instance = 0
 
     def active(self, code: Code) -> bool:
-        """Whether the cause of this alarm still holds, confirmed or not."""
+        """Whether this alarm is in force, confirmed or not."""
         return code in self._active
 
     def hold(self, code: Code, cause: bool, aux: int) -> None:
-        """Raise the alarm if its cause holds, end it if not; `aux` (16 bit) tells more and may change."""
+        """Raise the alarm if its cause holds, end it if not; `aux` (16 bit) tells more and may change.
+
+        To be called once per step. An alarm younger than `STEPS_AT_LEAST` outlives its cause.
+        """
         alarm = self._active.get(code)
         if cause and alarm is None:
             self._active[code] = _Alarm(self._next_instance, State.PENDING, aux & 0xFFFF)
             self._next_instance = (self._next_instance + 1) % INSTANCES
         elif cause and alarm is not None:
             alarm.aux = aux & 0xFFFF
-        elif alarm is not None and alarm.state != State.INACTIVE:
+        elif alarm is not None and alarm.steps >= STEPS_AT_LEAST and alarm.state != State.INACTIVE:
             alarm.state = State.INACTIVE
             alarm.changed = True
 
@@ -93,6 +100,11 @@ class Alarms:
                 alarm.changed = True
                 return True
         return False
+
+    def repeat(self, code: Code) -> None:
+        """Send this alarm in the next report even if nothing about it has changed."""
+        if code in self._active:
+            self._active[code].changed = True
 
     def report(self, turn: Turn) -> None:
         """Send what changed and what is pending, highest priority first; forget what has ended."""
@@ -109,5 +121,6 @@ class Alarms:
                     CtrlAlarmAux=alarm.aux,
                 )
                 alarm.changed = False
+            alarm.steps += 1
             if alarm.state == State.INACTIVE:
                 del self._active[code]

@@ -64,6 +64,7 @@ class Calibration:
         self._fields = codec.message("CFG_Param").fields
         self._received: dict[int, int] = {}
         self._active: dict[str, int] = {}
+        self._active_crc = 0
         self.parameters: Ints = [0] * len(layout.PARAMETERS)
 
     @property
@@ -81,7 +82,7 @@ class Calibration:
         if index == SET_CRC_INDEX and name is not None:
             if set_crc(self._received) == values[name]:
                 self._activate()
-            stored = set_crc(self._received) if self.active else 0
+            stored = self._active_crc
         elif name is None:
             stored = 0
         else:
@@ -105,3 +106,4 @@ class Calibration:
             parameters.append(values.get(name, 0))
         self.parameters = parameters
         self._active = values
+        self._active_crc = set_crc(self._received)

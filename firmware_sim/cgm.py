@@ -31,7 +31,7 @@ class Verdict:
     glucose: int = -1  # 0.1 mg/dL, -1 = nothing usable
     refused: int = 0  # samples refused for what they say or when they were taken
     repeated: int = 0  # samples refused as not newer than the last one
-    missing: int = 0  # sample numbers skipped
+    missing: int = 0  # sample numbers skipped whose frames never came
 
 
 class Cgm:
@@ -40,6 +40,7 @@ class Cgm:
     def __init__(self) -> None:
         self._sequence: int | None = None
         self._taken: int | None = None  # step of the newest usable sample
+        self._unused = 0  # frames since the newest usable sample that came and could not be used
         self.streak = 0  # steps in a row with a usable sample
         self.since_gap = 0  # usable samples since the last gap longer than AGE_USABLE
 
@@ -57,6 +58,10 @@ class Cgm:
         """Whether trends must not be trusted yet."""
         return self.since_gap < SETTLING_SAMPLES
 
+    def skip(self) -> None:
+        """A frame came that E2E does not allow to read: its sample is unused, not lost."""
+        self._unused += 1
+
     def judge(self, samples: list[dict[str, int]], step: int) -> Verdict:
         """Take the CGM_Reading frames that arrived for instant `step` (checked by E2E before)."""
         verdict = Verdict()
@@ -66,6 +71,7 @@ class Cgm:
             age = (step - sample["CgmSampleStep"]) % 256
             if glucose < 0 or age > AGE_USABLE:
                 verdict.refused += 1
+                self._unused += 1
                 continue
             number = sample["CgmSampleSeq"]
             if self._sequence is not None:
@@ -73,7 +79,8 @@ class Cgm:
                 if not 0 < ahead < SEQUENCE_MODULUS // 2:
                     verdict.repeated += 1
                     continue
-                verdict.missing += ahead - 1
+                verdict.missing += max(ahead - 1 - self._unused, 0)
+            self._unused = 0
             self._sequence = number
             self._taken = step - age
             verdict.glucose = glucose

@@ -31,6 +31,9 @@ VERSION = (0, 1)
 SUPPORTED_MODES = (MODE_OFF, MODE_OPEN_LOOP, MODE_NMA, MODE_S2)
 """Modes this build accepts from MODE_Cmd; the rest are refused with DoseRejected."""
 
+COMMANDING = (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN)
+"""States in which the control law commands rates; in the others its limits cut nothing."""
+
 ALARM_HOLD = 3
 """Quiet steps after which the alarm of a passing error ends (project's choice)."""
 
@@ -39,6 +42,9 @@ NMT_BOOT_UP, NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 0, 5, 127
 REQUEST_SUSPEND, REQUEST_RESUME = 1, 2
 
 STEP_SNA = 1048575
+
+MODE_SEQUENCES = 255
+"""ModeCmdSeq runs from 0 to 254; 255 is SNA."""
 
 
 def subscriptions() -> list[str]:
@@ -86,8 +92,10 @@ class Firmware:
         self._peer_version: tuple[int, int] | None = None
         self._toggle = 0
         self._crc_errors_seen = 0
-        self._missing_samples = 0
+        self._lost_samples_seen = 0  # of the CGM, by the counter of its frames, when the newest sample came
+        self._lost_unseen = 0  # CGM frames lost that this counter could not show
         self._sequence_errors = 0
+        self._reported_state = State.INIT
         self._last_e2e_error = -STEP_SNA
         self._last_implausible = -STEP_SNA
         self._last_limited = -STEP_SNA
@@ -99,6 +107,8 @@ class Firmware:
         """Take one frame; only a token is answered."""
         check, name, values, _ = self._receiver.receive(frame)
         if check > Check.OK_SOME_LOST:
+            if check == Check.WRONG_SEQUENCE and name == "CGM_Reading":
+                self._cgm.skip()
             return ()
         if name == "SYNC_Step":
             return self._on_token(values)
@@ -123,9 +133,14 @@ class Firmware:
         self._turn.send("CFG_ParamEcho", **self._calibration.store(values))
 
     def _on_mode_cmd(self, values: dict[str, int]) -> None:
-        if values["ModeCmdSeq"] == self._mode_sequence:
+        sequence = values["ModeCmdSeq"]
+        if sequence == self._mode_sequence:
             return
-        self._mode_sequence = values["ModeCmdSeq"]
+        last = sequence - 1 if self._mode_sequence is None else self._mode_sequence
+        if sequence >= MODE_SEQUENCES or (sequence - last) % MODE_SEQUENCES > MODE_SEQUENCES // 2:
+            self._sequence_errors += 1
+            return
+        self._mode_sequence = sequence
         if values["ModeRequest"] in SUPPORTED_MODES:
             self._mode = values["ModeRequest"]
         else:
@@ -189,8 +204,11 @@ class Firmware:
     def _judge_sensor(self, step: int) -> int:
         verdict = self._cgm.judge(self._samples, step)
         self._samples = []
-        # samples the 4-bit counter could not miss: a gap of 16 looks like none
-        self._missing_samples += verdict.missing
+        if verdict.glucose >= 0:
+            # the 4-bit counter of the frames is blind to a gap of 16, the number of the sample is not
+            lost = self._receiver.lost_of("CGM_Reading")
+            self._lost_unseen += max(verdict.missing - (lost - self._lost_samples_seen), 0)
+            self._lost_samples_seen = lost
         self._sequence_errors += verdict.repeated
         if verdict.refused or verdict.repeated:
             self._last_implausible = step
@@ -221,7 +239,9 @@ class Firmware:
             control_step(self._state, self._calibration.parameters, inputs, self._outputs)
 
     def _command(self, state: State, step: int) -> None:
-        if state in (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN):
+        if state == State.DELIVERY_UNCERTAIN and self._ladder.rung == State.SAFE_BASAL:
+            self._pump.command(self._turn, Op.RESUME_SCHEDULE, step)
+        elif state in (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN):
             rate, pramlintide = self._outputs[layout.OUT_RATE], self._outputs[layout.OUT_PRAM_RATE]
             self._pump.command(self._turn, Op.SET_RATE, step, rate, pramlintide if rate > 0 else 0)
         elif state == State.SUSPENDED:
@@ -240,13 +260,19 @@ class Firmware:
         if self._rejected:
             self._last_rejected = step
             self._rejected = False
-        lost = age >= AGE_DEGRADED or (alarms.active(Code.CGM_LOST) and state in (State.DEGRADED, State.SAFE_BASAL))
+        down = self._ladder.rung != State.AUTO
+        lost = age >= AGE_DEGRADED or (down and (alarms.active(Code.CGM_LOST) or state == self._ladder.rung))
         alarms.hold(Code.CGM_LOST, lost and self._calibration.active, min(age, 0xFFFF))
         alarms.hold(Code.CGM_IMPLAUSIBLE, step - self._last_implausible < ALARM_HOLD, step)
         alarms.hold(Code.E2E_FAULT, step - self._last_e2e_error < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_REJECTED, step - self._last_rejected < ALARM_HOLD, step)
         alarms.hold(Code.PUMP_LOST, state == State.DELIVERY_UNCERTAIN, step)
+        if state != self._reported_state:
+            # every change of state is told with its cause in the same step, also to a user who has confirmed it
+            self._reported_state = state
+            alarms.repeat(Code.CGM_LOST)
+            alarms.repeat(Code.PUMP_LOST)
         alarms.report(self._turn)
 
     def _report_status(self, state: State) -> None:
@@ -256,7 +282,7 @@ class Firmware:
             CtrlMode=self._mode,
             CtrlState=state,
             InsulinOnBoard=self._outputs[layout.OUT_IOB],
-            LimiterBits=self._outputs[layout.OUT_LIMITERS],
+            LimiterBits=self._outputs[layout.OUT_LIMITERS] if state in COMMANDING else 0,
             **({} if used is None else {"LastCgmSeq": used}),
         )
         receiver = self._receiver
@@ -271,8 +297,7 @@ class Firmware:
         self._send_heartbeat(NMT_OPERATIONAL if self._calibration.active else NMT_PRE_OPERATIONAL)
 
     def _lost_frames(self) -> int:
-        by_counter = self._receiver.lost_of("CGM_Reading")
-        return self._receiver.lost + max(self._missing_samples - by_counter, 0)
+        return self._receiver.lost + self._lost_unseen
 
     def _send_heartbeat(self, nmt: int) -> None:
         self._turn.send("HB_CTRL", NmtCtrl=nmt, ToggleCtrl=self._toggle, ResetCauseCtrl=0, BootCtrl=0)

@@ -37,6 +37,11 @@ class Ladder:
         self.state = State.INIT
         self._rung = State.SAFE_BASAL  # what the CGM alone allows, remembered under Suspended and the like
 
+    @property
+    def rung(self) -> State:
+        """What the CGM alone allows: AUTO, DEGRADED or SAFE_BASAL, whatever stands above it."""
+        return self._rung
+
     def update(self, *, calibrated: bool, suspended: bool, age: int, streak: int, pump_age: int) -> State:
         """One step.
 

@@ -15,6 +15,8 @@ SEQUENCES = 1023
 TOTAL_MODULUS = 16777214
 """Totals at or above this raw value are reserved codes."""
 
+BOOT_COUNT_SNA = 15
+
 NEVER = 1 << 20
 
 
@@ -33,7 +35,7 @@ class Pump:
         self._sequence = SEQUENCES - 1
         self._confirmed_total: int | None = None  # mU, the newest total
         self._boot_count: int | None = None
-        self._estimated = 0  # mU assumed for steps whose total has not come
+        self._estimated = 0  # mU assumed and not yet covered by a total
         self._commanded_rate: int | None = None  # 0.005 U/h in force by our last command; None = schedule
         self._status_step = -NEVER
         self._totals_step = -NEVER
@@ -61,7 +63,7 @@ class Pump:
         Returns:
             mU; -1 while no total has ever come.
         """
-        if totals is not None and totals["InsulinTotal"] < TOTAL_MODULUS:
+        if totals is not None and self._believable(totals):
             return self._settle(totals["InsulinTotal"], totals["PumpBootCount"], step)
         if self._confirmed_total is None:
             return -1
@@ -70,20 +72,29 @@ class Pump:
         self._estimated += estimate
         return estimate
 
+    def _believable(self, totals: dict[str, int]) -> bool:
+        """Whether a total can be what it claims; one that is not counts as not received."""
+        if totals["InsulinTotal"] >= TOTAL_MODULUS or totals["PumpBootCount"] >= BOOT_COUNT_SNA:
+            return False
+        last = self._confirmed_total
+        if last is not None and totals["InsulinTotal"] < last and totals["PumpBootCount"] == self._boot_count:
+            self.refused += 1  # a total never falls without a reset of the pump
+            return False
+        return True
+
     def _settle(self, total: int, boot_count: int, step: int) -> int:
         last = self._confirmed_total
-        rebooted = self._boot_count is not None and boot_count != self._boot_count
-        if last is not None and total < last and not rebooted:
-            self.refused += 1  # a total never falls without a reset: as if not received
-            return 0
+        rebooted = boot_count != self._boot_count
         self._totals_step = step
         self._confirmed_total = total
         self._boot_count = boot_count
-        estimated = self._estimated
-        self._estimated = 0
         if last is None:
             return -1
-        return max((total if rebooted else total - last) - estimated, 0)
+        delivered = total if rebooted else total - last
+        estimated = self._estimated
+        # what was assumed too much comes off the next steps; before a reset it may well have been delivered
+        self._estimated = 0 if rebooted else max(estimated - delivered, 0)
+        return max(delivered - estimated, 0)
 
     def command(self, turn: Turn, op: Op, step: int, rate: int = 0, pramlintide_rate: int = 0) -> None:
         """Send the set-point of this step, with a new number and an absolute expiry.

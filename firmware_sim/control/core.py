@@ -98,7 +98,9 @@ def control_step(state: Ints, parameters: Ints, inputs: Ints, outputs: Ints) -> 
     if mode == MODE_OFF:
         demand = 0
     elif mode != MODE_OPEN_LOOP:
-        demand += meal
+        counts = state[SATURATIONS : SATURATIONS + 1]
+        demand = saturate(demand + meal, counts)
+        state[SATURATIONS] = counts[0]
     outputs[OUT_DEMAND] = demand
     outputs[OUT_RATE] = limit_rate(demand, state, parameters, inputs, outputs)
     outputs[OUT_PRAM_RATE] = 0

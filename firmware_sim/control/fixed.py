@@ -33,7 +33,7 @@ def saturate(value: int, counts: Ints) -> int:
 
 
 def round_shift(value: int, bits: int) -> int:
-    """Value / 2**bits, rounded; |value| below 2**62."""
+    """Value / 2**bits, rounded; |value| + 2**(bits - 1) below 2**63."""
     return (value + (1 << (bits - 1))) >> bits
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from can_bus.codec import Check, Receiver
 from can_bus.frame import Frame
-from can_bus.lockstep import Phase
+from can_bus.lockstep import Done, Phase
 from plant_server import mechanism
 
 WATCHED = (
@@ -52,7 +52,7 @@ class Monitor:
         self._used: int | None = None
         self._lost_alarm = False
         self._totals: dict[str, int] | None = None
-        self._phase = Phase.INIT
+        self._phase: int = Phase.INIT
         self.limiter_steps = 0
         self.diag: dict[str, int] | None = None
         self.injected = 0
@@ -67,7 +67,7 @@ class Monitor:
     # ---- what the device was told
 
     def _on_sync_step(self, values: dict[str, int]) -> None:
-        self._phase = Phase(values["SyncPhase"])
+        self._phase = values["SyncPhase"]
 
     def _on_cgm_reading(self, values: dict[str, int]) -> None:
         state, glucose = values["CgmState"], values["GlucoseConc"]
@@ -118,17 +118,20 @@ class Monitor:
         self.diag = values
 
     def _on_sync_done(self, values: dict[str, int]) -> None:
-        if self._phase == Phase.STEP:
+        if values["DoneStatus"] == Done.CONTINUE:
+            return  # the step goes on
+        if self._phase in (Phase.STEP, Phase.CONTINUE):
             self._judge(values["DoneStepIndex"])
         self._fresh = []
         self._command = None
+        self._totals = None
 
     def _judge(self, step: int) -> None:
         for sequence, sample_step in self._fresh:
             age = (step - sample_step) % 256
             if age <= AGE_RAISE and sequence not in self._sequences:
                 self._sequences.add(sequence)
-                self._taken = step - age
+                self._taken = step - age if self._taken is None else max(self._taken, step - age)
         if self._used is not None and self._used != 65535 and self._used not in self._sequences:
             self.hazards["H3"] += 1
         age = NEVER if self._taken is None else step - self._taken
