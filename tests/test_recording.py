@@ -123,6 +123,10 @@ def test_states_faults_and_log(run: Run) -> None:
     assert run.columns("/state/5_insulin_line")["StateChange:state"] == ["Clear", "Occluded", "Clear"]
     fault = run.columns("/fault/Drop_CGM_Reading")
     assert list(zip(fault["sim_time"], fault["StateChange:state"], strict=True)) == [(7200.0, "Drop"), (10800.0, "")]
+    alarm = run.columns("/alarm/Occlusion_PUMP")
+    assert [time // 300 for time in alarm["sim_time"]] == [150, 162]
+    assert alarm["StateChange:state"] == ["Pending", ""]
+    assert run.columns("/alarm/CgmLost_CTRL")["StateChange:state"] == ["Pending"]
     log = run.columns("/log")
     lines = list(zip(log["TextLog:level"], log["TextLog:text"], strict=True))
     assert ("FAULT", "d0 02:00  Drop CGM_Reading for 60 min") in lines

@@ -86,6 +86,8 @@ LANES: Final[tuple[tuple[str, str, str], ...]] = (
 """State lanes: signal, message, what a reader calls it."""
 
 
+PRIORITY_COLOURS: Final = {"High": RED, "Medium": ORANGE, "Low": YELLOW}
+
 GLUCOSE: Final = ("TruthGlucose", "GlucoseConc")
 
 
@@ -111,14 +113,13 @@ class Note:
 
 def notes(trace: Trace) -> list[Note]:
     """What happened, in order of time: alarms, injected faults, meals, changes of the firmware's state."""
-    colours = {"High": RED, "Medium": ORANGE, "Low": YELLOW}
     found = [
         Note(
             alarm.time_s,
             "ALARM",
             f"{alarm.node} {alarm.code} {'over' if alarm.state == 'Inactive' else alarm.state.lower()}"
             f" ({alarm.priority.lower()})",
-            GREY if alarm.state == "Inactive" else colours.get(alarm.priority, WHITE),
+            GREY if alarm.state == "Inactive" else PRIORITY_COLOURS.get(alarm.priority, WHITE),
         )
         for alarm in trace.alarms
     ]
@@ -279,12 +280,32 @@ class _Logger:
         for order, (signal, message, what) in enumerate(lanes):
             changes = state_changes(trace, signal, message)
             self.states(f"state/{order + 1}_{what}", changes, STATE_COLOURS.get(signal, {}))
+        self.alarms(trace)
         spans: dict[str, list[tuple[float, str]]] = {}
         for span in trace.fault_spans():
             kind = span.label.split(" ", 1)[0]
             spans.setdefault(span.label, []).extend([(span.start_s, kind), (span.end_s, "")])
         for label, changes in spans.items():
             self.states(f"fault/{label.replace(' ', '_')}", changes, {label.split(" ", 1)[0]: RED})
+
+    def alarms(self, trace: Trace) -> None:
+        """A lane for each alarm code of each node: the state of its newest instance, in the colour of its priority."""
+        lanes: dict[str, list[tuple[float, str]]] = {}
+        standing: dict[str, set[int]] = {}
+        tints: dict[str, dict[str, tuple[int, int, int]]] = {}
+        for alarm in trace.alarms:
+            lane = f"alarm/{alarm.code}_{alarm.node}"
+            instances = standing.setdefault(lane, set())
+            if alarm.state == "Inactive":
+                instances.discard(alarm.instance)
+                if not instances:
+                    lanes.setdefault(lane, []).append((alarm.time_s, ""))
+            else:
+                instances.add(alarm.instance)
+                tints.setdefault(lane, {})[alarm.state] = PRIORITY_COLOURS.get(alarm.priority, GREY)
+                lanes.setdefault(lane, []).append((alarm.time_s, alarm.state))
+        for lane, changes in lanes.items():
+            self.states(lane, changes, tints.get(lane, {}))
 
     def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, tuple[int, int, int]]) -> None:
         if not changes:
@@ -393,7 +414,13 @@ def _hue(name: str) -> tuple[int, int, int]:
 
 
 def blueprint(
-    start_s: float, end_s: float, *, gateway: bool = False, bus_top: float = 50.0, glucose_top: float = 320.0
+    start_s: float,
+    end_s: float,
+    *,
+    gateway: bool = False,
+    bus_top: float = 60.0,
+    glucose_top: float = 320.0,
+    lanes: int = 6,
 ) -> Any:
     """The layout of a recording as a `rerun.blueprint.Blueprint`, with all time axes linked.
 
@@ -402,14 +429,13 @@ def blueprint(
         gateway: whether a second bus, the plant's, was recorded.
         bus_top: upper end of the axis of frames per step.
         glucose_top: upper end of the axis of glucose, mg/dL; the same for all runs that stay below it, to compare them.
+        lanes: number of alarms, faults and states to make room for.
     """
     import rerun as rr  # noqa: PLC0415
     import rerun.blueprint as rrb  # noqa: PLC0415
 
-    span = end_s - start_s
-    nanos = [
-        round(time_s * 1e9) for time_s in (start_s - 0.17 * span, end_s + 0.01 * span)
-    ]  # legends stand on the left
+    left_margin, right_margin = 0.17 * (end_s - start_s), 0.01 * (end_s - start_s)  # the legends stand on the left
+    nanos = [round(time_s * 1e9) for time_s in (start_s - left_margin, end_s + right_margin)]
     window = rr.TimeRange(
         start=rr.TimeRangeBoundary.absolute(nanos=nanos[0]), end=rr.TimeRangeBoundary.absolute(nanos=nanos[1])
     )
@@ -433,9 +459,11 @@ def blueprint(
         plot("Pramlintide: commanded against delivered", ["pramlintide/**"]),
         plot("Stomach", ["stomach/**"]),
         rrb.StateTimelineView(
-            name="States and injected faults", contents=["+ /state/**", "+ /fault/**"], time_view=axis
+            name="Alarms, injected faults, states",
+            contents=["+ /alarm/**", "+ /fault/**", "+ /state/**"],
+            time_view=axis,
         ),
-        row_shares=[3.6, 2.6, 2.6, 2.1, 3.6],
+        row_shares=[3.4, 2.4, 2.4, 1.9, min(1.2 + 0.5 * lanes, 6.0)],
     )
     log_columns = rrb.TextLogColumns(
         timeline_columns=[rrb.components.TimelineColumn(TIMELINE, visible=False)], text_log_columns=["loglevel", "body"]
@@ -538,6 +566,7 @@ def write_recording(trace: Trace, frames: Frames, path: Path, metrics: Mapping[s
         max(end_s, STEP_SECONDS),
         gateway=bool(np.any(frames.channel == 1)),
         bus_top=3.0 * _usual_frames(frames),
+        lanes=_lane_count(trace),
         glucose_top=max(320.0, *(np.nanmax(np.append(trace.get(name), 0.0)) + 20 for name in GLUCOSE)),
     )
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".recording-") as directory:
@@ -559,6 +588,11 @@ def write_recording(trace: Trace, frames: Frames, path: Path, metrics: Mapping[s
         _rrd(["optimize", str(raw), "-o", str(final)], environment)
         _rrd(["verify", str(final)], environment)
         final.replace(path)
+
+
+def _lane_count(trace: Trace) -> int:
+    states = sum(signal in trace.columns for signal, _, _ in LANES)
+    return states + len({span.label for span in trace.fault_spans()}) + len({(a.code, a.node) for a in trace.alarms})
 
 
 def _usual_frames(frames: Frames) -> float:

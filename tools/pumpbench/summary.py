@@ -78,9 +78,9 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
     rest = 10 - 1.25 - lane_height - text_height
     shares = [0.55 * rest, 0.40 * rest, 0.05 * rest] if dry else [0.44 * rest, 0.30 * rest, 0.26 * rest]
     axes = figure.subplots(4, 1, sharex=True, height_ratios=[*shares, lane_height]).tolist()
-    figure.subplots_adjust(left=0.062, right=0.838, top=0.925, bottom=(0.45 + text_height) / 10, hspace=0.09)
-    figure.text(0.06, 0.965, title(trace.info), fontsize=16, fontweight="bold", va="center")
-    figure.text(0.06, 0.94, _headline(trace, metrics), fontsize=11.5, va="center", color="#444444")
+    figure.subplots_adjust(left=0.094, right=0.838, top=0.925, bottom=(0.45 + text_height) / 10, hspace=0.09)
+    figure.text(0.094, 0.965, title(trace.info), fontsize=16, fontweight="bold", va="center")
+    figure.text(0.094, 0.94, _headline(trace, metrics), fontsize=11.5, va="center", color="#444444")
     end_s = max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
     start_s = float(trace.time_s[0]) if len(trace) else 0.0
     _glucose(axes[0], trace)
@@ -272,13 +272,13 @@ def _lanes(trace: Trace) -> list[Lane]:
     faults: dict[str, list[Bar]] = {}
     for span in trace.fault_spans():
         faults.setdefault(span.label, []).append(Bar(span.start_s, span.end_s, span.label, FAULT))
-    lanes += [Lane("fault", bars) for bars in list(faults.values())[:MAX_LANES]]
+    lanes += [Lane(f"fault {bars[0].text.split(' ')[0]}", bars) for bars in list(faults.values())[:MAX_LANES]]
     if len(faults) > MAX_LANES:
         lanes.append(Lane("more faults", [bar for bars in list(faults.values())[MAX_LANES:] for bar in bars]))
     alarms: dict[str, list[Bar]] = {}
     for bar in alarm_bars(trace, end_s):
         alarms.setdefault(bar.text, []).append(bar)
-    lanes += [Lane("alarm", bars) for bars in list(alarms.values())[:MAX_LANES]]
+    lanes += [Lane(f"alarm {code}", bars) for code, bars in list(alarms.items())[:MAX_LANES]]
     if len(alarms) > MAX_LANES:
         lanes.append(Lane("more alarms", [bar for bars in list(alarms.values())[MAX_LANES:] for bar in bars]))
     return lanes
@@ -302,14 +302,14 @@ def alarm_bars(trace: Trace, end_s: float) -> list[Bar]:
 
 def _draw_lanes(axis: Any, lanes: Sequence[Lane], span_s: float) -> None:
     axis.set_ylim(max(len(lanes), 1) - 0.45, -0.55)
-    axis.set_yticks(range(len(lanes)), [lane.name for lane in lanes], fontsize=9)
+    axis.set_yticks(range(len(lanes)), [lane.name for lane in lanes], fontsize=8.5)
     axis.tick_params(axis="y", length=0)
     for side in ("top", "right", "left"):
         axis.spines[side].set_visible(False)
     unnamed: dict[str, Any] = {}  # states whose bars are too short for their name
-    points = 0.776 * 1600 * 72 / 100  # width of the axis
+    points = 0.744 * 1600 * 72 / 100  # width of the axis
     for row, lane in enumerate(lanes):
-        event = lane.name.endswith(("fault", "faults", "alarm", "alarms"))
+        is_fault, is_alarm = "fault" in lane.name, "alarm" in lane.name
         free_from = -np.inf
         for bar in lane.bars:
             width = max(bar.end_s - bar.start_s, 0.0015 * span_s)
@@ -321,11 +321,11 @@ def _draw_lanes(axis: Any, lanes: Sequence[Lane], span_s: float) -> None:
                         bar.start_s + width / 2, row, bar.text, ha="center", va="center", fontsize=8, color="white"
                     )
                     free_from = bar.start_s + width
-            elif event:
+            elif is_fault or lane.name == "more alarms":
                 if bar.start_s >= free_from:
                     _beside(axis, row, bar, width, lane.bars, needed)
                     free_from = bar.start_s + width + needed
-            else:
+            elif not is_alarm:
                 unnamed.setdefault(bar.text, bar.colour)
     if unnamed:
         patches = [_patch(colour) for colour in unnamed.values()]
@@ -410,7 +410,7 @@ def _alarm_lines(trace: Trace) -> list[tuple[str, str]]:
 
 def _write_lines(figure: Any, lines: Sequence[tuple[str, str]], rows: int, height: float) -> None:
     top = (0.12 + height - 0.2) / 10
-    figure.text(0.008, top, "Alarms", fontsize=9.5, fontweight="bold", va="center")
+    figure.text(0.05, top, "Alarms", fontsize=9.5, fontweight="bold", va="center")
     for index, (text, colour) in enumerate(lines):
         column, row = divmod(index, rows)
-        figure.text(0.06 + 0.31 * column, top - 0.019 * row, text, fontsize=9.5, color=colour, va="center")
+        figure.text(0.094 + 0.30 * column, top - 0.019 * row, text, fontsize=9.5, color=colour, va="center")
