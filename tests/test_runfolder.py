@@ -163,6 +163,9 @@ def test_a_changed_log_is_noticed(copy: Path) -> None:
     log.write_text("".join(lines[:50] + lines[51:]))
     with pytest.raises(RunFolderError, match=r"bus\.log was changed"):
         _ = RunFolder.load(copy).frames
+    (copy / "run.json").write_text(json.dumps(RunFolder.load(copy).info | {"dbc_crc32": "0badcafe"}))
+    with pytest.raises(RunFolderError, match=r"bus\.log was recorded with another pumpbench\.dbc: CRC-32 0badcafe"):
+        _ = RunFolder.load(copy).frames
 
 
 def test_fourteen_days_take_seconds(tmp_path: Path) -> None:

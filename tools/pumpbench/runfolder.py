@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import dbc
 from pumpbench.capture import Frames, read_candump, write_candump
 from pumpbench.trace import PARQUET_NAME, Trace
 
@@ -139,7 +140,8 @@ class RunFolder:
             write(path)
         except (OSError, RuntimeError) as error:
             free = shutil.disk_usage(self.partial).free if self.partial.exists() else 0
-            full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or free < 1_000_000
+            full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error)
+            full = full or free < 1_000_000
             reason = (
                 f"the disk is full ({free // 1024} KiB free)" if full else getattr(error, "strerror", "") or str(error)
             )
@@ -201,6 +203,11 @@ class RunFolder:
         except ValueError as error:
             raise RunFolderError(str(error)) from None
         if "trace_sha256" in self.info and frames.sha256() != self.info["trace_sha256"]:
+            theirs, ours = self.info.get("dbc_crc32"), f"{dbc.crc32():08x}"
+            if theirs not in (None, ours):
+                raise RunFolderError(
+                    f"{path} was recorded with another pumpbench.dbc: CRC-32 {theirs}, this one {ours}"
+                )
             raise RunFolderError(f"{path} was changed: its frames do not have the hash that {RUN} states")
         return frames
 
