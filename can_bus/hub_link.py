@@ -19,6 +19,7 @@ from can_bus.frame import MAX_DATA, RECORD_SIZE, Frame, pack, unpack
 from can_bus.link import BaseLink, BusLost
 
 _CHUNK = 16384  # larger allocations cost more than the second receive they save
+SHORT = 0.1  # SO_RCVTIMEO counts in jiffies of up to 10 ms; waits below this use poll, which is exact
 _SEND_LIMIT = 60.0
 _CLOSE_LIMIT = 2.0
 _RETRY = 0.02
@@ -76,6 +77,8 @@ class HubLink(BaseLink):
         except BaseException:
             self._socket.close()
             raise
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
         self._read: Callable[..., bytes] = self._socket.recv
 
     def _greet(self, echo: bool, timeout: float) -> None:
@@ -129,7 +132,9 @@ class HubLink(BaseLink):
 
     def _receive(self, timeout: float | None, size: int) -> list[Frame]:
         try:
-            if timeout == 0:
+            if timeout is not None and timeout < SHORT:
+                if timeout > 0:
+                    self._readable.poll(timeout * 1000)
                 chunk = self._read(size, socket.MSG_DONTWAIT)
             else:
                 if timeout != self._timeout:

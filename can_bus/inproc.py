@@ -152,6 +152,8 @@ class InprocLink(BaseLink):
         return frames[0]
 
     def _take(self, timeout: float | None) -> list[Frame]:
+        if self._dead is not None:
+            raise self._lose("")
         if self._rest:
             frames, self._rest = self._rest, []
             return frames
@@ -162,8 +164,6 @@ class InprocLink(BaseLink):
         try:
             batch = queue.get_nowait() if timeout == 0 else queue.get(True, timeout)
         except Empty:
-            if self._dead is not None:
-                raise self._lose("") from None
             return []
         if isinstance(batch, str):
             raise self._lose(batch)
@@ -215,8 +215,10 @@ def _checked(frames: Sequence[Frame]) -> list[Frame]:
     batch = []
     for frame in frames:
         can_id, data = frame
-        if len(data) > MAX_DATA or not 0 <= can_id <= 0xFFFFFFFF:
-            raise ValueError(f"not a classic CAN frame: {frame}")
+        if len(data) > MAX_DATA:
+            raise ValueError("not a classic CAN frame: more than 8 data bytes")
+        if not 0 <= can_id <= 0xFFFFFFFF:
+            raise ValueError("not a classic CAN frame: the id does not fit 32 bits")
         if can_id & CAN_RTR_FLAG or type(data) is not bytes or type(frame) is not Frame:
             batch.append(Frame(can_id, bytes(len(data)) if can_id & CAN_RTR_FLAG else bytes(data)))
         else:

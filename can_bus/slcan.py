@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import select
 import threading
 import time
@@ -40,6 +41,7 @@ class SlcanLink(BaseLink):
         self._in_step = False
         self._sent = False
         self._lock = threading.Lock()
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC)  # ends a receive in another thread when this link is closed
         self._poll: select.poll | None = None
         try:
             descriptor = self._port.fileno()
@@ -48,6 +50,7 @@ class SlcanLink(BaseLink):
         else:
             self._poll = select.poll()
             self._poll.register(descriptor, select.POLLIN)
+            self._poll.register(self._wake, select.POLLIN)
         self._port.timeout = 0
         self._port.write_timeout = _WRITE_LIMIT
 
@@ -74,9 +77,12 @@ class SlcanLink(BaseLink):
                 first = self._port.read(1)
                 self._port.timeout = 0
                 return bytes(first + self._port.read(_CHUNK))
-            if not self._poll.poll(None if timeout is None else max(0.0, timeout * 1000)):
-                return b""
-            return bytes(self._port.read(_CHUNK))
+            ready = self._poll.poll(None if timeout is None else max(0.0, timeout * 1000))
+            if self._dead is not None:
+                raise self._lose("")
+            return bytes(self._port.read(_CHUNK)) if ready else b""
+        except can.CanError:
+            raise
         except (OSError, TypeError) as error:  # pyserial's errors are OSErrors; TypeError: closed in another thread
             raise self._lose(f"the serial port is gone ({error})") from error
 
@@ -124,13 +130,20 @@ class SlcanLink(BaseLink):
 
     def close(self) -> None:
         """Close the adapter's channel and the port; a second call does nothing."""
-        if self._port.is_open:
-            self._closed()
-            try:
-                self._bus.shutdown()
-            except (can.CanError, OSError) as error:  # the adapter was pulled: there is nobody left to close
-                _log.debug("%s: %s", self._url, error)
-            self._port.close()
+        if self._wake < 0:
+            return
+        self._closed()
+        os.eventfd_write(self._wake, 1)
+        stream = getattr(self._port, "_socket", None)
+        try:
+            self._bus.shutdown()
+        except (can.CanError, OSError) as error:  # the adapter was pulled: there is nobody left to close
+            _log.debug("%s: %s", self._url, error)
+        self._port.close()
+        if stream is not None:  # pyserial leaves it open when the other side closed first
+            stream.close()
+        wake, self._wake = self._wake, -1
+        os.close(wake)
 
 
 def _line(frame: Frame) -> bytes:

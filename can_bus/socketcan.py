@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import select
 import socket
 import struct
 import time
@@ -13,7 +14,7 @@ from collections.abc import Iterable, Sequence
 import can
 
 from can_bus.frame import CAN_EFF_FLAG, CAN_SFF_MASK, RECORD_SIZE, Frame, pack, unpack
-from can_bus.hub_link import timeval
+from can_bus.hub_link import SHORT, timeval
 from can_bus.link import BaseLink
 
 _SOL_CAN_RAW = 101
@@ -49,6 +50,9 @@ class SocketcanLink(BaseLink):
         self._bus = _open(channel)
         self._socket: socket.socket = self._bus.socket
         self._timeout: float | None = None
+        self._reading = False
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
         self._inbox = FrameBatch(self._socket.fileno())
         self._outboxes = [FrameBatch(self._socket.fileno())]
         self._socket.setblocking(True)
@@ -64,6 +68,13 @@ class SocketcanLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return all frames that wait, waiting for the first; see ``Link.recv``."""
+        self._reading = True
+        try:
+            return self._recv(timeout)
+        finally:
+            self._reading = False
+
+    def _recv(self, timeout: float | None) -> list[Frame]:
         left = timeout
         end: float | None = None  # the clock is only read when the first look was not enough: a guest pays for it
         while True:
@@ -76,6 +87,8 @@ class SocketcanLink(BaseLink):
                     return frames
                 wait = 0.0
             else:
+                if self._dead is not None:
+                    raise self._lose("")
                 self._check_drops()
             if left is not None:
                 now = time.monotonic()
@@ -87,8 +100,10 @@ class SocketcanLink(BaseLink):
     def _receive(self, timeout: float) -> list[Frame]:
         if self._dead is not None:
             raise self._lose("")
-        if timeout <= 0:
+        if timeout < SHORT:
             flags = int(socket.MSG_DONTWAIT)
+            if timeout > 0:
+                self._readable.poll(timeout * 1000)
         else:
             flags = MSG_WAITFORONE
             if timeout != self._timeout:
@@ -144,9 +159,12 @@ class SocketcanLink(BaseLink):
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Leave the bus; a second call does nothing."""
+        """Leave the bus; a second call does nothing. It waits for a receive in another thread, up to a second."""
         if self._socket.fileno() >= 0:
             self._closed()
+            end = time.monotonic() + 2 * _SLICE
+            while self._reading and time.monotonic() < end:  # its descriptor must not become another file's
+                time.sleep(0.01)
             self._bus.shutdown()
 
 
