@@ -230,7 +230,8 @@ def dropping(message: str, steps: range, announce: Callable[[int, Frame], Frame 
     """A gateway that drops a message during some steps and says so with FAULT_Inject, once per frame."""
     can_id = codec.message(message).can_id
     tx = codec.Transmitter()
-    target = codec.message(message).sender
+    sender = codec.message(message).sender
+    target = sender if sender in ("CGM", "PUMP", "CTRL", "UI") else "Bus"
 
     def fault(step: int, frame: Frame) -> list[Frame]:
         if frame.can_id == can_id and step in steps:

@@ -122,6 +122,30 @@ def test_capture_can_go_on_after_finish() -> None:
     assert same(capture.finish(), made.capture.finish())
 
 
+def test_the_end_of_an_earlier_run_on_the_same_bus_is_left_out() -> None:
+    earlier, made = Loop(12), Loop(8)
+    earlier.run()
+    made.run()
+    capture = Capture()
+    for _, frame in [*earlier.sent[-90:], *made.sent]:
+        capture.extend(0, [frame])
+    assert same(capture.finish(), made.capture.finish())
+
+
+def test_a_replayed_roll_call_ends_no_record() -> None:
+    made = Loop(8)
+    made.run()
+    call = next(frame for _, frame in made.sent if frame.can_id == codec.message("SYNC_Step").can_id)
+    capture = Capture()
+    for index, (channel, frame) in enumerate(made.sent):
+        capture.extend(channel, [frame])
+        if index in (len(made.sent) // 2, len(made.sent) - 1):
+            capture.extend(channel, [call])
+    frames = capture.finish()
+    assert len(frames) == len(made.capture.finish()) + 2
+    assert frames.step[-1] == 8
+
+
 def test_free_run_belongs_to_the_last_token() -> None:
     tx = codec.Transmitter()
     capture = Capture()

@@ -195,6 +195,11 @@ def test_an_announcement_seen_on_both_buses_is_one_event() -> None:
     assert len(Trace.from_frames(capture.finish()).faults) == 2
 
 
+def test_the_truth_is_taken_from_the_plants_bus() -> None:
+    truth = Trace.from_frames(Loop(10, faults=dropping("PLANT_Truth", range(3, 5))).run().finish())
+    assert not np.isnan(truth.columns["TruthGlucose"]).any()
+
+
 def test_frames_that_fail_their_check_are_not_believed() -> None:
     made = Loop(5)
     made.run()

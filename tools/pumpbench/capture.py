@@ -45,7 +45,7 @@ _RECORD: Final = np.dtype([("can_id", "<u4"), ("length", "u1"), ("pad", "V3"), (
 _HASHED: Final = np.dtype([("channel", "u1"), ("step", "<u4"), ("can_id", "<u4"), ("length", "u1"), ("data", "V8")])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frames:
     """All frames of a run in canonical order: by step; within a step channel 0 in bus order, then channel 1.
 
@@ -211,23 +211,28 @@ def _read_tokens(can_id: Array, good: Array, words: Array) -> list[_Token]:
 
 
 def _without_roll_call(can_id: Array, good: Array, tokens: list[_Token], done: Array) -> Array:
-    """Mask of the frames after the roll call: after the answer to the last call before the first real turn."""
+    """Mask of the frames after the roll call that starts the run: the last one that calibration or step 0 follows.
+
+    An Init token anywhere else is an injected fault, or a call nobody answered.
+    """
     keep = np.ones(len(can_id), bool)
-    init = _phases()["Init"]
-    calls = 0
-    while calls < len(tokens) and tokens[calls].phase == init:
-        calls += 1
-    if calls == 0:
+    phases = _phases()
+    called, opening = -1, len(can_id)
+    for token, following in zip(tokens, [*tokens[1:], None], strict=True):
+        if token.phase != phases["Init"]:
+            continue
+        if following is None:
+            if called < 0 and all(other.phase == phases["Init"] for other in tokens):
+                keep[:] = False  # nothing but the roll call: there was no run
+        elif following.phase == phases["Config"] or (following.phase != phases["Init"] and following.step == 0):
+            called, opening = token.row, following.row
+    if called < 0:
         return keep
-    last = tokens[calls - 1].row
-    opening = tokens[calls].row if calls < len(tokens) else len(can_id)
-    answers = done[(done > last) & (done < opening)]
-    keep[: (answers[0] if len(answers) else last) + 1] = False
+    answers = done[(done > called) & (done < opening)]
+    keep[: (answers[0] if len(answers) else called) + 1] = False
     # answers to earlier calls that arrive late are no part of the record either
     answer_ids = [codec.message(name).can_id for name in ("SYNC_Done", "CTRL_Info")]
     keep[:opening] &= ~np.isin(can_id[:opening], answer_ids)
-    if calls == len(tokens):
-        keep[:] = False  # nothing but the roll call: there was no run
     return keep
 
 
@@ -258,7 +263,7 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
     tokens = _read_tokens(can_id, good, words)
     done = np.flatnonzero((can_id == codec.message("SYNC_Done").can_id) & good)
     keep = _without_roll_call(can_id, good, tokens, done)
-    tokens = [token for token in tokens if keep[token.row]]
+    tokens = [token for token in tokens if keep[token.row] and token.phase != _phases()["Init"]]
     done = done[keep[done]]
     turns = _turns(tokens, done)
     count = len(can_id)

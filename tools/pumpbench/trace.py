@@ -218,7 +218,7 @@ class FaultSpan:
     end_s: float
 
 
-@dataclass
+@dataclass(eq=False)
 class Trace:
     """A run, one row per step.
 
@@ -435,11 +435,13 @@ class _Builder:
         for message in codec.messages().values():
             if message.can_id not in present:
                 continue
-            decoded = decode(self.frames, message.name, 0)
+            anywhere = message.name in (
+                "PLANT_Truth",
+                "FAULT_Inject",
+            )  # they tell of the run, the device need not see them
+            decoded = decode(self.frames, message.name, None if anywhere else 0)
             if not len(decoded.rows):
-                if message.name not in ("PLANT_Truth", "FAULT_Inject"):
-                    continue
-                decoded = decode(self.frames, message.name)  # the gateway may keep these from the device
+                continue
             if message.name == "PUMP_BolusState":
                 codes = {label: code for code, label in labels(message.name, "BolusStateHormone").items()}
                 for hormone in HORMONES:
