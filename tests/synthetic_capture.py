@@ -74,6 +74,11 @@ class Loop:
         self.done(self.steps)
         return self.capture
 
+    def run_frames(self) -> list[tuple[int, Frame]]:
+        """Run, and return channel and frame of everything sent, in order."""
+        self.run()
+        return self.sent
+
     def glucose(self, k: int) -> float:
         day = k % 288
         rise = sum(

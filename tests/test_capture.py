@@ -201,6 +201,42 @@ def test_repeated_and_replayed_tokens_open_no_turn() -> None:
     assert np.bincount(frames.step).tolist() == (np.bincount(whole.step) + (np.arange(9) == 3) * 2).tolist()
 
 
+def test_tokens_from_another_time_open_no_turn() -> None:
+    made = Loop(30)
+    made.run()
+    tx = codec.Transmitter()
+    token = codec.message("SYNC_Step").can_id
+    capture = Capture()
+    for index, (channel, frame) in enumerate(made.sent):
+        capture.extend(channel, [frame])
+        if frame.can_id == token and index > 100:
+            capture.extend(0, [tx.frame("SYNC_Step", SyncPhase=1, StepIndex=step, SimTime=9) for step in (20, 1000000)])
+    frames = capture.finish()
+    whole = made.capture.finish()
+    assert frames.step.max() == 30
+    ours = codec.message("CGM_Reading").can_id
+    assert np.array_equal(frames.step[frames.can_id == ours], whole.step[whole.can_id == ours])
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_no_traffic_breaks_it(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pool = [frame for _, frame in random_frames(8, seed)] + [frame for _, frame in Loop(3).run_frames()]
+    capture = Capture()
+    for index in rng.integers(len(pool), size=400):
+        frame = pool[index]
+        if rng.random() < 0.2:
+            frame = Frame(int(rng.integers(2**32)), rng.bytes(int(rng.integers(9))))
+        capture.extend(int(rng.integers(2)), [frame])
+    frames = capture.finish()
+    for channel in (0, 1):
+        mine = frames.select(frames.channel == channel)
+        assert (np.diff(mine.time_s) > 0).all()
+        assert (np.diff(mine.step) >= 0).all()
+    write_candump(frames, tmp_path / "bus.log")
+    assert same(read_candump(tmp_path / "bus.log"), frames)
+
+
 def test_a_babbling_node_keeps_time_in_order() -> None:
     made = Loop(3)
     made.run()

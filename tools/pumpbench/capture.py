@@ -25,6 +25,7 @@ from can_bus.frame import (
     CAN_EFF_FLAG,
     CAN_ERR_FLAG,
     CAN_RTR_FLAG,
+    CAN_SFF_MASK,
     MAX_DATA,
     Frame,
     pack,
@@ -42,6 +43,7 @@ FRAME_MICROSECONDS: Final = 250
 """Simulated time between two frames of a turn, about what a frame takes at 500 kbit/s."""
 
 _RECORD: Final = np.dtype([("can_id", "<u4"), ("length", "u1"), ("pad", "V3"), ("data", "u1", (MAX_DATA,))])
+_FLAGS: Final = CAN_EFF_FLAG | CAN_ERR_FLAG
 _HASHED: Final = np.dtype([("channel", "u1"), ("step", "<u4"), ("can_id", "<u4"), ("length", "u1"), ("data", "V8")])
 
 
@@ -240,18 +242,19 @@ def _turns(tokens: list[_Token], done: Array) -> list[_Token]:
     """The tokens that open a turn: without repetitions, and without those an injected fault put out of order."""
     turns: list[_Token] = []
     config = _phases()["Config"]
+    steps = np.array([token.step for token in tokens])
     first = next((token.step for token in tokens if token.phase != config), 0)
     for index, read in enumerate(tokens):
         token = read._replace(step=first, time_s=STEP_SECONDS * first) if read.phase == config else read
         if turns:
             current = turns[-1]
             answered = np.searchsorted(done, token.row) > np.searchsorted(done, current.row)
-            if token[1:] == current[1:] and not answered:
+            if token.step < current.step or (token[1:] == current[1:] and not answered):
                 continue
-            if token.step < current.step:
-                continue
-            if token.step > current.step + 1 and index + 1 < len(tokens) and tokens[index + 1].step < token.step:
-                continue
+            if token.step > current.step + 1:  # believed only if the count goes on from there
+                later = steps[index + 1 :]
+                if not np.any(later >= token.step) or np.any((later > current.step) & (later < token.step)):
+                    continue
         turns.append(token)
     return turns
 
@@ -328,7 +331,10 @@ def _canonical(records: dict[int, Array]) -> Frames:
     for channel in sorted(records):
         record = records[channel]
         can_id, length = record["can_id"].astype("u4"), record["length"].astype("u1")
-        data = record["data"].reshape(-1, MAX_DATA) * (np.arange(MAX_DATA) < length[:, None]).astype("u1")
+        # what no CAN bus can carry is written down as the nearest that it can, so that a log says the same
+        can_id[(can_id > CAN_SFF_MASK) & (can_id & _FLAGS == 0)] |= np.uint32(CAN_EFF_FLAG)
+        carried = (np.arange(MAX_DATA) < length[:, None]) & (can_id & CAN_RTR_FLAG == 0)[:, None]
+        data = record["data"].reshape(-1, MAX_DATA) * carried.astype("u1")
         keep, step, turn, micros = _assign(can_id, length, data)
         channels = np.full(int(keep.sum()), channel, "u1")
         time_s = micros[keep] / 1e6
@@ -362,7 +368,7 @@ def write_candump(frames: Frames, path: Path, names: Sequence[str] = ("can0", "c
     micros = np.rint(frames.time_s[order] * 1e6).astype("i8").tolist()
     channels, ids = frames.channel[order].tolist(), frames.can_id[order].tolist()
     lengths, data = frames.length[order].tolist(), frames.data[order].tobytes().hex().upper()
-    flags = CAN_EFF_FLAG | CAN_ERR_FLAG
+    flags = _FLAGS
     with path.open("w", encoding="ascii", newline="\n") as file:
         for row, (micro, channel, can_id, length) in enumerate(zip(micros, channels, ids, lengths, strict=True)):
             seconds, fraction = divmod(micro, 1_000_000)
