@@ -428,13 +428,14 @@ class Hub:
         _log.error("%s is too slow, %d frames wait for it (cap %d): disconnected", client.name, frames, self._cap)
         self._dismiss(client, Reason.OVERRUN, frames)
 
-    def _dismiss(self, client: _Client, reason: Reason, detail: int) -> None:
-        """Take a client off the bus, with a goodbye behind the record that is half sent."""
+    def _dismiss(self, client: _Client, reason: Reason, detail: int, *, deliver: bool = False) -> None:
+        """Take a client off the bus, with a goodbye behind all that waits, or behind the record that is half sent."""
         if client.member:
             self._set_members(member for member in self._members if member is not client)
         client.member = False
         client.partial = b""
-        del client.out[len(client.out) % RECORD_SIZE :]
+        if not deliver:
+            del client.out[len(client.out) % RECORD_SIZE :]
         client.out += hub_wire.goodbye(reason, detail)
         client.deadline = time.monotonic() + _LINGER
         self._leaving += 1
@@ -513,11 +514,15 @@ class Hub:
         end = time.monotonic() + linger
         while time.monotonic() < end and self.poll(0):
             pass
-        while any(client.out for client in self._members):
-            left = end - time.monotonic()
-            if left <= 0:
-                break
+        readers = self._members
+        for client in readers:
+            self._dismiss(client, Reason.CLOSED, 0, deliver=True)
+        self.poll(0)
+        while any(client.out for client in readers) and (left := end - time.monotonic()) > 0:
             self.poll(left)
+        for client in readers:
+            if client.out:
+                _log.error("%s did not take %d frames before the end", client.name, len(client.out) // RECORD_SIZE - 1)
         for client in list(self._clients.values()):
             self._part(client)
         self.closed = True
@@ -526,11 +531,6 @@ class Hub:
         os.close(self._wake)
 
     def _part(self, client: _Client) -> None:
-        if client.member and client.out:
-            _log.error("%s did not take %d frames before the end", client.name, len(client.out) // RECORD_SIZE)
-        if client.member and not client.out and not client.mute:
-            with contextlib.suppress(OSError):
-                client.sock.send(hub_wire.goodbye(Reason.CLOSED))
         with contextlib.suppress(OSError):
             client.sock.shutdown(socket.SHUT_WR)
             for _ in range(64):  # closing TCP over unread input would reset what is on its way

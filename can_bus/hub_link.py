@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import select
 import socket
@@ -194,14 +195,23 @@ class HubLink(BaseLink):
         try:
             with self._lock:
                 if self._hangup is not None and self._hangup.poll(0):  # TCP would swallow the first batch silently
-                    raise self._lose("the hub is gone")
+                    raise self._lose(self._last_words() or "the hub is gone")
                 self._socket.sendall(records)
         except BlockingIOError as error:
             raise self._lose(f"the hub has not read for {_SEND_LIMIT:g} s") from error
         except can.CanError:
             raise
         except OSError as error:
-            raise self._lose(f"the hub is gone ({error.strerror})") from error
+            raise self._lose(self._last_words() or f"the hub is gone ({error.strerror})") from error
+
+    def _last_words(self) -> str | None:
+        """Return the goodbye that may wait behind unread frames; they can't be trusted to be all, so they go."""
+        text = self._partial
+        with contextlib.suppress(OSError):
+            while chunk := self._socket.recv(_CHUNK, socket.MSG_DONTWAIT):
+                text = text[len(text) // RECORD_SIZE * RECORD_SIZE - RECORD_SIZE :] + chunk
+        whole = len(text) // RECORD_SIZE * RECORD_SIZE
+        return hub_wire.goodbye_text(text[whole - RECORD_SIZE : whole]) if whole else None
 
     def fileno(self) -> int:
         """The socket; it is readable when frames or the end of the bus are waiting."""

@@ -546,7 +546,7 @@ def test_a_reader_stopped_for_a_second_loses_nothing(rig: Rig) -> None:
 @on(PROCESSES)
 def test_a_killed_peer_disturbs_nobody(rig: Rig) -> None:
     listener, sender, victim = rig.link(filters=[0x101, 0x102]), rig.node(filters=[]), rig.node(filters=[])
-    victim.start(send_all, 2, 300_000)
+    victim.start(send_all, 2, 100_000)
     seen = listener.recv(LIMIT)
     victim.kill()
     sender.start(send_all, 1, 1000)

@@ -23,6 +23,7 @@ from typing import Final, NamedTuple, TypedDict
 from can_bus.address import parse_address
 from can_bus.frame import RECORD_SIZE, Frame, pack
 from can_bus.hub import Hub
+from can_bus.hub_link import timeval
 from can_bus.link import Link
 from can_bus.socketcan import MSG_WAITFORONE, FrameBatch
 from can_bus.url import open_link
@@ -169,7 +170,12 @@ class _Crew:
         if joins:
             self._processes.append(process)
         assert process.stdout is not None
-        return "" if role in _SILENT else process.stdout.readline().decode().strip()
+        if role in _SILENT:
+            return ""
+        line = process.stdout.readline().decode().strip()
+        if not line:
+            raise RuntimeError(f"a process of the benchmark ({role}) did not start")
+        return line
 
     def join(self) -> None:
         """Wait until every process has seen all it should have."""
@@ -249,6 +255,8 @@ def _bare_master(stack: contextlib.ExitStack, crew: _Crew, folder: Path, listene
         got = 0
         while got < expected:
             chunk = member.recv(65536)
+            if not chunk:
+                raise RuntimeError("the member is gone")
             if other is not None:
                 other.sendall(chunk)
             got += len(chunk)
@@ -277,7 +285,10 @@ def _stream_step(sock: socket.socket, n_to: int, n_back: int) -> Step:
         sock.sendall(records)
         got = 0
         while got < expected:
-            got += len(sock.recv(65536))
+            chunk = sock.recv(65536)
+            if not chunk:
+                raise RuntimeError("the relay is gone")
+            got += len(chunk)
 
     return step
 
@@ -331,9 +342,15 @@ def _listening(url: str) -> Iterator[tuple[socket.socket, str]]:
         yield server, f"tcp:127.0.0.1:{server.getsockname()[1]}" if address.is_tcp else url
 
 
+def _bound(sock: socket.socket) -> None:
+    """Let the kernel end a receive that waits for a process that died; Python's time-outs would cost a call."""
+    sock.settimeout(None)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeval(_LIMIT))
+
+
 def _accepted(server: socket.socket) -> socket.socket:
     connection, _ = server.accept()
-    connection.settimeout(None)
+    _bound(connection)
     if connection.family is not socket.AF_UNIX:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
@@ -343,6 +360,7 @@ def _connected(where: str) -> socket.socket:
     address = parse_address(where)
     connection = socket.socket(address.family, socket.SOCK_STREAM)
     connection.connect(address.target)
+    _bound(connection)
     if address.is_tcp:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
@@ -352,6 +370,7 @@ def _can_socket(channel: str) -> socket.socket:
     sock = socket.socket(29, socket.SOCK_RAW, 1)  # AF_CAN, CAN_RAW: by number, so that it can be said anywhere
     try:
         sock.bind((channel,))
+        _bound(sock)
         with contextlib.suppress(PermissionError):
             sock.setsockopt(socket.SOL_SOCKET, 33, 64 << 20)  # SO_RCVBUFFORCE
     except BaseException:
@@ -391,13 +410,19 @@ def _bare_member(sock: socket.socket, steps: int, n_to: int, n_back: int) -> Non
     for _ in range(steps):
         got = 0
         while got < expected:
-            got += len(sock.recv(65536))
+            chunk = sock.recv(65536)
+            if not chunk:
+                raise RuntimeError("the master is gone")
+            got += len(chunk)
         sock.sendall(answer)
 
 
 def _bare_listener(sock: socket.socket, size: int) -> None:
     while size > 0:
-        size -= len(sock.recv(65536))
+        chunk = sock.recv(65536)
+        if not chunk:
+            raise RuntimeError(f"{size} bytes did not come")
+        size -= len(chunk)
 
 
 def _bare_can_member(sock: socket.socket, steps: int, n_to: int, n_back: int) -> None:
