@@ -129,7 +129,7 @@ class MessageCodec:
                 self.selector = signal.name
         self._initial = initial
         self.pages = {key: tuple(fields) for key, fields in pages.items()}
-        self._packers: dict[tuple[str, ...], Packer] = {}
+        self._packers: dict[tuple[str | int | None, ...], Packer] = {}
         self._unpack = _unpacker(common)
         self._unpack_page = {key: _unpacker(common + fields) for key, fields in pages.items()}
 
@@ -140,24 +140,22 @@ class MessageCodec:
             CodecError: an unknown signal, one of another page than the selector's, or a value neither in the signal's
                 range nor one of its named codes.
         """
-        if self.selector is None:
-            packer = self._packers.get(names := tuple(values))
-            if packer is None:
-                packer = self._packers[names] = _packer(self._start(names), [self._field(name) for name in names])
-            word = packer(*values.values())
-            if word is not None:
-                return word
-        return self._pack_with_care(values)
+        key = (*values,) if self.selector is None else (*values, values.get(self.selector))
+        packer = self._packers.get(key)
+        if packer is None:
+            packer = self._packers[key] = _packer(self._start(values), [self._field(name) for name in values])
+        word = packer(*values.values())
+        return self._pack_with_care(values) if word is None else word
 
     def _pack_with_care(self, values: Mapping[str, int]) -> int:
-        """The same for multiplexed messages and reserved codes, and the place where errors are found."""
+        """The same with reserved codes among the values; the place where values out of range are found."""
         word = self._start(values)
         for name, value in values.items():
             _, shift, mask, _, low, high, reserved = self._field(name)
             if not low <= value <= high and value not in reserved:
                 raise CodecError(f"{self.name}.{name}: raw value {value} is outside {low}..{high}")
             word |= (value & mask) << shift
-        return word if self.selector is None else self._turn_page(self.selector, word, values)
+        return word
 
     def _field(self, name: str) -> Field:
         try:
@@ -165,23 +163,20 @@ class MessageCodec:
         except KeyError:
             raise CodecError(f"{self.name} has no signal {name}; it has {', '.join(self.fields)}") from None
 
-    def _start(self, names: Iterable[str]) -> int:
-        """The start values of all signals but these."""
+    def _start(self, values: Mapping[str, int]) -> int:
+        """The start values of all signals but these, with those of the page that is selected."""
         word = self._initial
-        for name in names:
+        if self.selector is not None:
+            field = self.fields[self.selector]
+            page = values.get(self.selector, word >> field.shift & field.mask)
+            for name in values:
+                if self._page_of.get(name, page) != page:
+                    raise CodecError(f"{self.name}.{name} does not exist when {self.selector} is {page}")
+            for field in self.pages.get(page, ()):
+                word |= self._page_start[field.name]
+        for name in values:
             field = self._field(name)
             word &= ~(field.mask << field.shift)
-        return word
-
-    def _turn_page(self, selector: str, word: int, values: Mapping[str, int]) -> int:
-        """Check that the values belong to the selected page, and add the start values of what was left out of it."""
-        page = word >> self.fields[selector].shift & self.fields[selector].mask
-        for name in values:
-            if self._page_of.get(name, page) != page:
-                raise CodecError(f"{self.name}.{name} does not exist when {selector} is {page}")
-        for field in self.pages.get(page, ()):
-            if field.name not in values:
-                word |= self._page_start[field.name]
         return word
 
     def unpack(self, data: bytes) -> dict[str, int]:
