@@ -218,7 +218,7 @@ def test_tokens_from_another_time_open_no_turn() -> None:
     assert np.array_equal(frames.step[frames.can_id == ours], whole.step[whole.can_id == ours])
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(15))
 def test_no_traffic_breaks_it(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     pool = [frame for _, frame in random_frames(8, seed)] + [frame for _, frame in Loop(3).run_frames()]

@@ -84,7 +84,7 @@ def test_many_alarms_are_counted_not_piled_up(tmp_path: Path) -> None:
     colours(tmp_path / "many.png")
 
 
-@pytest.mark.parametrize("steps", [0, 1, 400])
+@pytest.mark.parametrize("steps", [0, 1])
 def test_any_length(tmp_path: Path, steps: int) -> None:
     frames = Loop(steps).run().finish() if steps else Capture().finish()
     write_summary(Trace.from_frames(frames), tmp_path / "x.png")
