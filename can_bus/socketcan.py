@@ -17,6 +17,8 @@ from can_bus.frame import CAN_EFF_FLAG, CAN_SFF_MASK, RECORD_SIZE, Frame, pack, 
 from can_bus.hub_link import SHORT, timeval
 from can_bus.link import BaseLink
 
+_AF_CAN = 29
+_CAN_RAW = 1
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
 _SO_RCVBUFFORCE = 33
@@ -39,7 +41,8 @@ class SocketcanLink(BaseLink):
     The kernel throws frames away when a socket's receive queue is full (about 280 frames by default). This link asks
     for a queue of some 80,000 (root) or whatever ``net.core.rmem_max`` allows, and the kernel's count of what did not
     fit turns into a ``BusLost``, at the latest one second after. It cannot see frames that the interface itself lost
-    before the socket, on a real wire or in the kernel's backlog: the counters of the protocol do that.
+    before the socket, on a real wire or in the kernel's backlog: the counters of the protocol do that. And on a machine
+    with several CPUs, frames that two nodes send in the same instant may reach two readers in different orders.
     """
 
     def __init__(
@@ -166,6 +169,98 @@ class SocketcanLink(BaseLink):
             while self._reading and time.monotonic() < end:  # its descriptor must not become another file's
                 time.sleep(0.01)
             self._bus.shutdown()
+
+
+class _IoVector(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _MessageHeader(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.POINTER(_IoVector)),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    _fields_ = (("header", _MessageHeader), ("length", ctypes.c_uint))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class FrameBatch:
+    """Room for many frames, moved by one ``recvmmsg`` or ``sendmmsg`` (Python's own calls move one frame each)."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._buffer = ctypes.create_string_buffer(_BATCH * RECORD_SIZE)
+        self._view = memoryview(self._buffer).cast("B")
+        base = ctypes.addressof(self._buffer)
+        self._vectors = (_IoVector * _BATCH)(*[_IoVector(base + i * RECORD_SIZE, RECORD_SIZE) for i in range(_BATCH)])
+        self._messages = (_Message * _BATCH)()
+        for i, message in enumerate(self._messages):
+            message.header.vectors = ctypes.pointer(self._vectors[i])
+            message.header.vector_count = 1
+        self._headers = memoryview(self._messages).cast("B")
+        self._place = ctypes.byref(self._messages)
+
+    def receive(self, flags: int) -> int:
+        """Return how many frames were received; OSError as ``recv`` would raise it."""
+        while (count := _libc.recvmmsg(self._descriptor, self._place, _BATCH, flags, None)) < 0:
+            _raise_errno()
+        return int(count)
+
+    def send(self, records: bytes) -> int:
+        """Return how many of the records were sent, at least one; OSError as ``send`` would raise it."""
+        size = min(len(records), len(self._view))
+        self._view[:size] = records[:size]
+        while (count := _libc.sendmmsg(self._descriptor, self._place, size // RECORD_SIZE, 0)) < 0:
+            _raise_errno()
+        return int(count)
+
+    def truncated(self, index: int) -> bool:
+        """Whether control data of a received frame found no room."""
+        (flags,) = _FLAGS.unpack_from(self._headers, index * _MESSAGE_SIZE + _FLAGS_OFFSET)
+        return bool(flags & socket.MSG_CTRUNC)
+
+    def bytes(self, count: int) -> bytes:
+        """Return the first records."""
+        return self._view[: count * RECORD_SIZE].tobytes()
+
+
+_MESSAGE_SIZE = ctypes.sizeof(_Message)
+_FLAGS_OFFSET = _Message.header.offset + _MessageHeader.flags.offset
+
+
+def _raise_errno() -> None:
+    """Raise what the last call left in errno; an interrupted call returns, to be made again."""
+    number = ctypes.get_errno()
+    if number != errno.EINTR:
+        raise OSError(number, os.strerror(number))
+
+
+def _open(channel: str) -> can.interfaces.socketcan.SocketcanBus:
+    from can.interfaces.socketcan import SocketcanBus  # noqa: PLC0415
+
+    try:
+        socket.socket(_AF_CAN, socket.SOCK_RAW, _CAN_RAW).close()
+    except OSError as error:
+        reason = "this kernel has no CAN; see tools/with_vcan" if error.errno == errno.EAFNOSUPPORT else error.strerror
+        raise can.CanInitializationError(f"socketcan:{channel}: {reason}") from error
+    try:
+        if channel not in (name for _, name in socket.if_nameindex()):  # python-can would leave its socket open
+            raise OSError(errno.ENODEV, "no such interface")
+        return SocketcanBus(channel, local_loopback=True, receive_own_messages=False)
+    except OSError as error:
+        known = errno.ENODEV, errno.ENXIO
+        reason = "there is no such CAN interface (ip link)" if error.errno in known else error.strerror
+        raise can.CanInitializationError(f"socketcan:{channel}: {reason}") from error
 
 
 class _IoVector(ctypes.Structure):

@@ -7,6 +7,7 @@ a standalone hub, ``embedded`` one that this process hosts and drives. The same 
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import multiprocessing
 import os
@@ -39,7 +40,7 @@ from can_bus.frame import (
 )
 from can_bus.hub import Hub
 from can_bus.link import BusLost, Link
-from can_bus.socketcan import SocketcanLink
+from can_bus.socketcan import FrameBatch, SocketcanLink
 from can_bus.url import BusUrlError, open_bus, open_link
 
 LIMIT = 60.0
@@ -674,6 +675,66 @@ def test_an_overrun_on_vcan_is_loud(rig: Rig, behind: int) -> None:
     assert int(end.split(": ")[1].split()[0]) > 0
 
 
+class FullQueue:
+    """A transmit queue that is full for a while."""
+
+    def __init__(self, real: FrameBatch, times: float) -> None:
+        self._real = real
+        self._left = times
+
+    def send(self, records: bytes) -> int:
+        self._left -= 1
+        if self._left >= 0:
+            raise OSError(errno.ENOBUFS, "No buffer space available")
+        return self._real.send(records[:RECORD_SIZE])  # and then it takes one frame at a time
+
+
+@on([VCAN])
+def test_a_full_transmit_queue_is_waited_out(rig: Rig) -> None:
+    mine, other = rig.link(), rig.node()
+    assert isinstance(mine, SocketcanLink)
+    other.start(collect, 5)
+    mine._outboxes[:] = [FullQueue(mine._outboxes[0], 3)]  # type: ignore[list-item]
+    mine.send(numbered(1, 5))
+    assert other.result() == numbered(1, 5)
+
+
+@on([VCAN])
+def test_a_transmit_queue_that_stays_full_is_loud(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = rig.link()
+    assert isinstance(mine, SocketcanLink)
+    monkeypatch.setattr("can_bus.socketcan._SEND_LIMIT", 0.05)
+    mine._outboxes[:] = [FullQueue(mine._outboxes[0], float("inf"))]  # type: ignore[list-item]
+    with pytest.raises(BusLost, match=r"the transmit queue stayed full for 0\.05 s"):
+        mine.send(numbered(1, 1))
+
+
+@pytest.mark.parametrize("how", [["set", "vcan77", "down"], ["delete", "vcan77"]], ids=["down", "deleted"])
+@pytest.mark.vcan
+def test_an_interface_that_goes_away_is_loud(how: list[str]) -> None:
+    need_vcan()
+    if os.geteuid() != 0:
+        pytest.skip("needs root to make an interface of its own")
+
+    def ip(*words: str) -> int:
+        return subprocess.run(["ip", "link", *words], check=False).returncode
+
+    assert ip("add", "vcan77", "type", "vcan") == 0
+    try:
+        assert ip("set", "vcan77", "up") == 0
+        with open_link("socketcan:vcan77") as link:
+            assert link.recv(0) == []
+            assert ip(*how) == 0
+            with pytest.raises(BusLost, match="the interface is gone"):
+                link.recv(LIMIT)
+            with pytest.raises(BusLost, match="the interface is gone"):
+                link.send(numbered(1, 1))
+        with pytest.raises(can.CanInitializationError) if "delete" in how else contextlib.nullcontext():
+            open_link("socketcan:vcan77").close()
+    finally:
+        ip("delete", "vcan77")
+
+
 # -- URLs ------------------------------------------------------------------------------------------------------------
 
 
@@ -711,9 +772,10 @@ def test_a_wrong_url_is_one_clear_line(opens: Callable[[str], object], url: str,
 @pytest.mark.parametrize(
     ("url", "says"),
     [
+        pytest.param("socketcan:vcan98", "no such CAN interface", marks=pytest.mark.vcan),
         ("unix:/nowhere/bus", "no hub is serving there"),
         ("tcp:127.0.0.1:1", "no hub is serving there"),
-        ("socketcan:vcan99", "(no such interface|no CAN)"),
+        ("socketcan:vcan99", "(no such CAN interface|no CAN)"),
         ("slcan:/dev/nowhere@500000", "/dev/nowhere"),
         ("slcan:/dev/null@500000", "/dev/null"),
     ],
