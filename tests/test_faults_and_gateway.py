@@ -288,7 +288,7 @@ class Bench:
         for turn in range(1, turns + 1):
             self.put(self.device.frame("PUMP_BolusCmd"))
             self.done(step, Done.CONTINUE)
-            self.put(self.plant.frame("PUMP_Ack"))
+            self.put(self.plant.frame("PUMP_Ack", AckId=step))
             self.token(Phase.CONTINUE, step, step * STEP_SECONDS + turn)
         self.put(self.device.frame("PUMP_BasalCmd"))
         self.done(step)
@@ -347,6 +347,10 @@ def test_further_turns_do_not_advance_time() -> None:
     ).run(6, turns=3)
     assert bench.steps_of("PUMP_Ack") == [2, 2, 2]
     assert bench.steps_of("CGM_Reading") == [3]
+    ack = codec.message("PUMP_Ack")
+    assert [ack.unpack(frame.data)["AckId"] for frame in bench.arrived if frame.can_id == ack.can_id] == (
+        [0] * 3 + [1] * 3 + [3] * 3 + [4] * 3 + [5] * 3
+    )
 
 
 def test_a_count_runs_over_everything_the_fault_covers() -> None:
