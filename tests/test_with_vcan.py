@@ -347,7 +347,11 @@ def stage(tmp_path):
         (path / name).symlink_to(sys.executable if name == "python3" else shutil.which(name))
     (tmp_path / "tmp").mkdir()
     places = {"PATH": path, "XDG_CACHE_HOME": tmp_path / "cache", "TMPDIR": tmp_path / "tmp", "STAGE": tmp_path}
-    return tmp_path, path, environment(VCAN_FORCE="uml", VCAN_GUEST=None, PUMPBENCH_CACHE=None, **places)
+    return (
+        tmp_path,
+        path,
+        environment(VCAN_FORCE="uml", VCAN_MEM="64M", VCAN_GUEST=None, PUMPBENCH_CACHE=None, **places),
+    )
 
 
 def play_apt(path, *, known="true"):
