@@ -29,7 +29,10 @@ MODE_OFF, OPEN_LOOP, NMA, S2 = 0, 1, 2, 6
 GLUCOSE = 1200
 """0.1 mg/dL, the target of all adults: a firmware at rest asks for its schedule."""
 
-COUNTED_BY_CTRL = tuple(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
+SIM_TIME_SNA = 268435455
+"""SimTime of the steps after 8.5 years, which it cannot hold."""
+
+SENT_BY_CTRL = tuple(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
 
 
 @functools.cache
@@ -137,7 +140,7 @@ class Bench:
         self._calls = 0
         self._roll = Transmitter()
         self.transmitter = Transmitter()
-        self.receiver = Receiver(COUNTED_BY_CTRL)
+        self.receiver = Receiver(SENT_BY_CTRL)
         if start:
             self.call_roll()
             self.configure(self.flash, mode)
@@ -205,9 +208,9 @@ class Bench:
             answer = self.firmware.receive(token)
             if answer:
                 break
-        self.receiver = Receiver(COUNTED_BY_CTRL)
+        self.receiver = Receiver(SENT_BY_CTRL)
         turn = self.check(self.listen(answer), self._calls)
-        self.transmitter, self.receiver = Transmitter(), Receiver(COUNTED_BY_CTRL)
+        self.transmitter, self.receiver = Transmitter(), Receiver(SENT_BY_CTRL)
         return turn
 
     def configure(self, flash: dict[int, int], mode: int | None = None) -> Turn:
@@ -267,7 +270,7 @@ class Bench:
         total = self.delivered() if isinstance(totals, bool) else totals
         frames = [*cgm, *([state] if status else ()), *([total] if totals is not False else ()), *also]
         self.give(*frames)
-        turn = self.token(Phase.STEP, self.k, self.k * STEP_SECONDS)
+        turn = self.token(Phase.STEP, self.k, min(self.k * STEP_SECONDS, SIM_TIME_SNA))
         self.obey(turn)
         self.k += 1
         return turn
