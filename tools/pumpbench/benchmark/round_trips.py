@@ -70,7 +70,7 @@ def vcan_available(channel: str = "vcan0") -> bool:
         return False
 
 
-def round_trips(kinds: list[str] | None = None, *, steps: int = 5000, runs: int = 5) -> list[Figure]:
+def round_trips(kinds: list[str] | None = None, *, steps: int = 3000, runs: int = 7) -> list[Figure]:
     """Return rates and delays of one frame there and one back, for each kind of bus in ``CEILING_OF``.
 
     ``kinds`` None takes all that this machine has.
@@ -85,7 +85,7 @@ def round_trips(kinds: list[str] | None = None, *, steps: int = 5000, runs: int 
     return figures
 
 
-def pattern(url_kind: str, n_to: int, n_back: int, *, steps: int = 5000, runs: int = 5) -> Figure:
+def pattern(url_kind: str, n_to: int, n_back: int, *, steps: int = 3000, runs: int = 7) -> Figure:
     """Return the rate of a lockstep step's traffic: ``n_to`` frames out, ``n_back`` back, and a passive listener."""
     ours, bare = _runs(url_kind, steps, runs, n_to=n_to, n_back=n_back, listener=True)
     return _figure(f"steps/{url_kind}/{n_to}+{n_back}", "1/s", [s.rate for s in ours], [s.rate for s in bare])
@@ -477,8 +477,9 @@ def _play(role: str, where: str, steps: int, n_to: int, n_back: int) -> None:
             if role == "ready-can-member":
                 _bare_can_member(sock, steps, n_to, n_back)
             else:
-                for _ in range(frames):
-                    sock.recv(RECORD_SIZE)
+                batch = FrameBatch(sock.fileno())
+                while frames > 0:
+                    frames -= batch.receive(MSG_WAITFORONE)
     else:
         with open_link(where) as link:
             if role.startswith("ready-"):
