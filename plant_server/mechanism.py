@@ -1,7 +1,8 @@
-"""The pump's motor: rates become whole strokes, and every stroke is accounted for.
+"""The pump's motors: rates become whole strokes, and every stroke is accounted for.
 
 For each drug, in strokes and at every instant: commanded = delivered + pending + lost. A rate fills an accumulator in
-exact integer units; a full accumulator is one commanded stroke. Strokes are made on the 30-s grid of the plant.
+exact integer units; a full accumulator is one commanded stroke. Strokes are made on the 30-s grid of the plant. A made
+stroke reaches the patient, is held back by an occlusion (and stays pending), or was air (and is lost).
 """
 
 import numpy as np
@@ -23,19 +24,30 @@ PRAMLINTIDE_STROKE = 600
 STROKES_PER_SUBSTEP = 15
 """Fastest motor: a stroke every 2 s, 1.5 U/min of insulin (the order of commercial pumps)."""
 
-ACCUMULATED, COMMANDED, PENDING, DELIVERED, LOST = range(5)
-"""Words of one drug's motor."""
+ACCUMULATED, COMMANDED, PENDING, DELIVERED, LOST, HELD, FLUID, AIR = range(8)
+"""Words of one drug's motor, in strokes but for the first: HELD is the part of PENDING that an occlusion holds back in
+the line, FLUID what is left in the reservoir, AIR what of the line is air."""
 
 Words = npt.NDArray[np.int64]
 
 
-def motor() -> Words:
-    """A motor at rest that has delivered nothing."""
-    return np.zeros(5, dtype=np.int64)
+def motor(fluid: int) -> Words:
+    """A motor at rest that has delivered nothing, with `fluid` strokes in its reservoir."""
+    words = np.zeros(8, dtype=np.int64)
+    words[FLUID] = fluid
+    return words
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def run(words: Words, rate: int, stroke: int, volume: float, out: npt.NDArray[np.float64]) -> None:
+def run(
+    words: Words,
+    rate: int,
+    stroke: int,
+    volume: float,
+    blocked: bool,
+    stopped: bool,
+    out: npt.NDArray[np.float64],
+) -> None:
     """Run one motor for a sampling interval.
 
     Args:
@@ -43,7 +55,9 @@ def run(words: Words, rate: int, stroke: int, volume: float, out: npt.NDArray[np
         rate: in the unit of which `stroke` makes one stroke within 30 s.
         stroke: `INSULIN_STROKE` or `PRAMLINTIDE_STROKE`.
         volume: of one stroke, in U or ug.
-        out: gets the amount delivered within each 30-s step.
+        blocked: the line is occluded; what is held back comes out when it no longer is.
+        stopped: the pump has stopped this motor; what was asked for is lost and never caught up.
+        out: gets the amount that reaches the patient within each 30-s step.
     """
     for i in range(out.size):
         words[ACCUMULATED] += rate
@@ -51,12 +65,39 @@ def run(words: Words, rate: int, stroke: int, volume: float, out: npt.NDArray[np
         words[ACCUMULATED] -= strokes * stroke
         words[COMMANDED] += strokes
         words[PENDING] += strokes
-        made = min(words[PENDING], STROKES_PER_SUBSTEP)
-        words[PENDING] -= made
-        words[DELIVERED] += made
-        out[i] = made * volume
+        arrived = 0
+        if stopped:
+            waiting = words[PENDING] - words[HELD]
+            words[PENDING] -= waiting
+            words[LOST] += waiting
+        else:
+            made = min(words[PENDING] - words[HELD], STROKES_PER_SUBSTEP)
+            air = min(made, words[AIR])
+            words[AIR] -= air
+            fluid = min(made - air, words[FLUID])
+            words[FLUID] -= fluid
+            words[PENDING] -= made - fluid
+            words[LOST] += made - fluid
+            words[HELD] += fluid
+        if not blocked:
+            arrived = words[HELD]
+            words[HELD] = 0
+            words[PENDING] -= arrived
+            words[DELIVERED] += arrived
+        out[i] = arrived * volume
+
+
+def lose_held(words: Words) -> None:
+    """What an occlusion held back is lost, e.g. because the user changes the infusion set."""
+    words[PENDING] -= words[HELD]
+    words[LOST] += words[HELD]
+    words[HELD] = 0
 
 
 def ledger_closes(words: Words) -> bool:
     """Whether every stroke is accounted for."""
-    return bool(words[COMMANDED] == words[DELIVERED] + words[PENDING] + words[LOST])
+    return bool(
+        words[COMMANDED] == words[DELIVERED] + words[PENDING] + words[LOST]
+        and 0 <= words[HELD] <= words[PENDING]
+        and words[LOST] >= 0
+    )

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 
-from . import mechanism
+from .chamber import INSULIN, PRAMLINTIDE, Chamber, ChamberSettings, Occlusion
+from .mechanism import SUBSTEPS
 
 SEQUENCES = 1023
 EXPIRY_AHEAD_MAX = 24
@@ -42,6 +43,35 @@ class AckFor(enum.IntEnum):
     PRAM_RATE = 8
 
 
+class Alarm(enum.IntEnum):
+    """PUMP_Alarm.PumpAlarmCode."""
+
+    OCCLUSION = 5
+    RESERVOIR_LOW = 6
+    RESERVOIR_EMPTY = 7
+    BATTERY_LOW = 8
+    BATTERY_EMPTY = 9
+
+
+HIGH, MEDIUM = 3, 2
+PRIORITY = {
+    Alarm.OCCLUSION: HIGH,
+    Alarm.RESERVOIR_LOW: MEDIUM,
+    Alarm.RESERVOIR_EMPTY: HIGH,
+    Alarm.BATTERY_LOW: MEDIUM,
+    Alarm.BATTERY_EMPTY: HIGH,
+}
+"""PUMP_Alarm.PumpAlarmPriority of each code (requirement ALM-02)."""
+
+INACTIVE, PENDING, CONFIRMED = 0, 1, 2
+"""PUMP_Alarm.PumpAlarmState."""
+
+AUX_INSULIN, AUX_PRAMLINTIDE, AUX_PUMP = 1, 2, 0
+"""PUMP_Alarm.PumpAlarmAux: which drug it is about."""
+
+BATTERY_LOW_PERCENT = 20
+
+
 class AckResult(enum.IntEnum):
     """PUMP_Ack.AckResult."""
 
@@ -49,14 +79,17 @@ class AckResult(enum.IntEnum):
     DUPLICATE = 1
     EXPIRED = 2
     OVER_LIMIT = 3
+    WRONG_STATE = 4
     MALFORMED = 7
 
 
 class PumpState(enum.IntEnum):
     """PUMP_Status.PumpState."""
 
+    PRIMING = 1
     RUNNING = 3
     SUSPENDED = 4
+    STOPPED = 5
 
 
 @dataclass(frozen=True)
@@ -66,31 +99,32 @@ class PumpSettings:
     basal_milliunits_per_h: int  # stored schedule, 0.001 U/h
     max_rate_raw: int = 6000  # 30 U/h, the largest rate of commercial pumps
     max_pramlintide_rate_raw: int = 3000  # 300 ug/h: 10 ug/U at the largest insulin rate
-    insulin_reservoir_u: float = 300.0
-    pramlintide_reservoir_ug: float = 4000.0
-    change_every_steps: int = 3 * 288  # reservoirs and battery are changed every three days
+    insulin: ChamberSettings = INSULIN
+    pramlintide: ChamberSettings = PRAMLINTIDE
+    coformulation_ug_per_u: float | None = None  # one chamber with both drugs in it; None: two chambers
+    change_every_steps: int = 3 * 288  # reservoirs and battery are changed every three days; 0 = never
     battery_percent_per_day: float = 8.0
 
 
 class Pump:
-    """A two-chamber pump."""
+    """A pump with two chambers, or with one that holds both drugs."""
 
     def __init__(self, settings: PumpSettings) -> None:
         self.settings = settings
-        self.insulin = mechanism.motor()
-        self.pramlintide = mechanism.motor()
+        self.insulin = Chamber(settings.insulin)
+        self.pramlintide = Chamber(settings.pramlintide)
+        self.battery = 100.0
         self._rate = settings.basal_milliunits_per_h
         self._pramlintide_rate = 0
         self._commanded = False  # a set-point is in force, not the schedule
         self._suspended = False
+        self._priming = False
         self._expires = -1  # last step of the set-point in force
         self._sequence: int | None = None
         self._echo = (0, 0)
-        self._insulin_at_change = 0
-        self._pramlintide_at_change = 0
-        self._changed_at = 0
-        self._insulin_out = np.zeros(mechanism.SUBSTEPS)
-        self._pramlintide_out = np.zeros(mechanism.SUBSTEPS)
+        self._alarms: dict[tuple[Alarm, int], list[int]] = {}  # (code, drug) -> [instance, state, told]
+        self._next_instance = 0
+        self._mixed = np.zeros(SUBSTEPS)
 
     # ---- commands
 
@@ -131,10 +165,19 @@ class Pump:
             return late, late
         if operation != Op.SET_RATE:
             return AckResult.ACCEPTED, AckResult.ACCEPTED
-        return (
-            self._judge_rate(values["InsulinRate"], self.settings.max_rate_raw),
-            self._judge_rate(values["PramlintideRate"], self.settings.max_pramlintide_rate_raw),
-        )
+        insulin = self._judge_rate(values["InsulinRate"], self.settings.max_rate_raw)
+        pramlintide = self._judge_rate(values["PramlintideRate"], self.settings.max_pramlintide_rate_raw)
+        if pramlintide == AckResult.ACCEPTED and not self._mixture_fits(values):
+            pramlintide = AckResult.WRONG_STATE
+        return insulin, pramlintide
+
+    def _mixture_fits(self, values: dict[str, int]) -> bool:
+        """Whether a co-formulation can give this pramlintide rate with this insulin rate (to one LSB)."""
+        ratio = self.settings.coformulation_ug_per_u
+        if ratio is None:
+            return True
+        given = values["InsulinRate"] * MILLIUNITS_PER_LSB * ratio / 100
+        return abs(given - values["PramlintideRate"]) <= 1
 
     @staticmethod
     def _judge_rate(raw: int, limit: int) -> AckResult:
@@ -170,63 +213,140 @@ class Pump:
 
     # ---- delivery
 
+    @property
+    def powered(self) -> bool:
+        """Whether the battery still drives the motors."""
+        return self.battery > 0
+
     def deliver(self, step: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Run both motors from instant `step` to the next one.
 
         Returns:
-            Insulin (U) and pramlintide (ug) delivered within each of the ten 30-s steps; the arrays are used again.
+            Insulin (U) and pramlintide (ug) that reach the patient within each of the ten 30-s steps; the arrays are
+            used again.
         """
         if self._commanded and step > self._expires:
             self._fall_back()
-        mechanism.run(self.insulin, self._rate, mechanism.INSULIN_STROKE, mechanism.INSULIN_STROKE_U, self._insulin_out)
-        mechanism.run(
-            self.pramlintide,
-            self._pramlintide_rate,
-            mechanism.PRAMLINTIDE_STROKE,
-            mechanism.PRAMLINTIDE_STROKE_UG,
-            self._pramlintide_out,
-        )
-        return self._insulin_out, self._pramlintide_out
+        rate, pramlintide_rate = (self._rate, self._pramlintide_rate) if self.powered else (0, 0)
+        insulin = self.insulin.run(rate)
+        ratio = self.settings.coformulation_ug_per_u
+        if ratio is None:
+            pramlintide = self.pramlintide.run(pramlintide_rate)
+        else:
+            pramlintide = np.multiply(insulin, ratio, out=self._mixed)
+        self._age(step + 1)
+        return insulin, pramlintide
+
+    def _age(self, step: int) -> None:
+        """The battery runs down; the user changes it and the reservoirs in time."""
+        settings = self.settings
+        self.battery = max(self.battery - settings.battery_percent_per_day / 288, 0.0)
+        self._priming = settings.change_every_steps > 0 and step % settings.change_every_steps == 0
+        if self._priming:
+            self.battery = 100.0
+            self.insulin.change()
+            self.pramlintide.change()
 
     # ---- reports
 
-    def report(self, step: int, transmitter: Transmitter) -> list[Frame]:
-        """Status, totals and bolus states as they stand at instant `step`."""
-        settings = self.settings
-        if step - self._changed_at >= settings.change_every_steps:
-            self._changed_at = step
-            self._insulin_at_change = int(self.insulin[mechanism.DELIVERED])
-            self._pramlintide_at_change = int(self.pramlintide[mechanism.DELIVERED])
-        insulin = int(self.insulin[mechanism.DELIVERED])
-        pramlintide = int(self.pramlintide[mechanism.DELIVERED])
-        insulin_left = settings.insulin_reservoir_u - (insulin - self._insulin_at_change) * mechanism.INSULIN_STROKE_U
-        pramlintide_left = (
-            settings.pramlintide_reservoir_ug
-            - (pramlintide - self._pramlintide_at_change) * mechanism.PRAMLINTIDE_STROKE_UG
-        )
-        battery = 100.0 - (step - self._changed_at) / 288 * settings.battery_percent_per_day
-        sequence = {} if self._sequence is None else {"PumpLastBasalSeq": self._sequence}
+    def report(self, transmitter: Transmitter) -> list[Frame]:
+        """Alarms, status, totals and bolus states as they stand."""
+        insulin, pramlintide = self.insulin, self.pramlintide
+        ratio = self.settings.coformulation_ug_per_u
         frame = transmitter.frame
+        if ratio is None:
+            pram_left, pram_total = pramlintide.remaining, pramlintide.delivered * pramlintide.settings.stroke_volume
+            pram_occlusion = pramlintide.occlusion
+        else:
+            pram_left = insulin.remaining * ratio
+            pram_total = insulin.delivered * insulin.settings.stroke_volume * ratio
+            pram_occlusion = insulin.occlusion
+        sequence = {} if self._sequence is None else {"PumpLastBasalSeq": self._sequence}
         return [
+            *self._report_alarms(transmitter),
             frame(
                 "PUMP_Status",
-                PumpState=PumpState.SUSPENDED if self._suspended else PumpState.RUNNING,
-                InsulinReservoir=max(round(insulin_left * 10), 0),
-                PramReservoir=max(round(pramlintide_left), 0),
-                PumpBattery=max(round(battery), 0),
-                InsulinOcclusion=0,
-                PramOcclusion=0,
+                PumpState=self._state(),
+                InsulinReservoir=min(round(insulin.remaining * 10), 4000),
+                PramReservoir=min(round(pram_left), 4093),
+                PumpBattery=round(self.battery),
+                InsulinOcclusion=insulin.occlusion,
+                PramOcclusion=pram_occlusion,
                 TbrActive=int(self._commanded),
                 **sequence,
             ),
             frame(
                 "PUMP_Delivered",
                 PumpBootCount=0,
-                InsulinTotal=insulin * round(mechanism.INSULIN_STROKE_U * 1000),
-                PramTotal=pramlintide * round(mechanism.PRAMLINTIDE_STROKE_UG * 100),
+                InsulinTotal=round(insulin.delivered * insulin.settings.stroke_volume * 1000),
+                PramTotal=round(pram_total * 100),
             ),
             *(
                 frame("PUMP_BolusState", BolusStateHormone=hormone, BolusPhase=0, BolusDeliveredRaw=0)
                 for hormone in (1, 2)
             ),
         ]
+
+    def _state(self) -> PumpState:
+        if not self.powered or self.insulin.stopped:
+            return PumpState.STOPPED
+        if self._priming:
+            return PumpState.PRIMING
+        return PumpState.SUSPENDED if self._suspended else PumpState.RUNNING
+
+    # ---- alarms
+
+    def _causes(self) -> set[tuple[Alarm, int]]:
+        causes = set()
+        chambers = [(self.insulin, AUX_INSULIN)]
+        if self.settings.coformulation_ug_per_u is None:
+            chambers.append((self.pramlintide, AUX_PRAMLINTIDE))
+        for chamber, drug in chambers:
+            if chamber.occlusion == Occlusion.OCCLUDED:
+                causes.add((Alarm.OCCLUSION, drug))
+            if chamber.empty:
+                causes.add((Alarm.RESERVOIR_EMPTY, drug))
+            elif chamber.low:
+                causes.add((Alarm.RESERVOIR_LOW, drug))
+        if not self.powered:
+            causes.add((Alarm.BATTERY_EMPTY, AUX_PUMP))
+        elif self.battery <= BATTERY_LOW_PERCENT:
+            causes.add((Alarm.BATTERY_LOW, AUX_PUMP))
+        return causes
+
+    def _report_alarms(self, transmitter: Transmitter) -> list[Frame]:
+        """One frame per change of state, repeated until confirmed."""
+        causes = self._causes()
+        for cause in sorted(causes - self._alarms.keys()):
+            self._alarms[cause] = [self._next_instance, PENDING, False]
+            self._next_instance = (self._next_instance + 1) % 65535
+        frames = []
+        for (code, drug), alarm in sorted(self._alarms.items(), key=lambda item: (-PRIORITY[item[0][0]], item[1][0])):
+            if (code, drug) not in causes:
+                alarm[1:] = [INACTIVE, False]
+            instance, state, told = alarm
+            if told and state != PENDING:
+                continue
+            alarm[2] = True
+            frames.append(
+                transmitter.frame(
+                    "PUMP_Alarm",
+                    PumpAlarmState=state,
+                    PumpAlarmPriority=PRIORITY[code],
+                    PumpAlarmCode=code,
+                    PumpAlarmInstance=instance,
+                    PumpAlarmAux=drug,
+                )
+            )
+        self._alarms = {cause: alarm for cause, alarm in self._alarms.items() if cause in causes}
+        return frames
+
+    def pending_alarms(self) -> list[int]:
+        """Instances that the user has been told of and has not confirmed."""
+        return [instance for instance, state, told in self._alarms.values() if state == PENDING and told]
+
+    def acknowledge(self, instance: int) -> None:
+        """The user confirms an alarm; its cause stays."""
+        for alarm in self._alarms.values():
+            if alarm[0] == instance and alarm[1] == PENDING:
+                alarm[1:] = [CONFIRMED, False]

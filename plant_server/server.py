@@ -20,13 +20,13 @@ from . import mechanism, physiology
 from .physiology import Patient, Variability
 from .pump import Pump, PumpSettings
 from .scenario import EATING_MINUTES, Scenario
-from .sensor import STATE_OK, Sensor
+from .sensor import Sensor, SensorSettings
 
 PMOL_PER_L_PER_MU_PER_L = 6.0
 """The model's conversion of plasma insulin: 1 mU/L = 6 pmol/L (Dalla Man et al. 2007)."""
 
-RATE_UNKNOWN = -1024
-"""CGM_Reading.GlucoseRate SNA."""
+GLUCOSE_UNKNOWN, RATE_UNKNOWN = 8191, -1024
+"""CGM_Reading.GlucoseConc and GlucoseRate SNA."""
 
 ALARM_PENDING = 1
 
@@ -44,7 +44,7 @@ class Run(NamedTuple):
     seed: int
     mode: int  # CtrlMode to ask for
     calibration: Mapping[int, int]  # CfgIndex -> raw value, the CRC of the set last
-    sensor: str = "coloured"
+    sensor: str | SensorSettings = "coloured"
     variability: tuple[str, ...] = tuple(physiology.SOURCES)
 
 
@@ -63,7 +63,6 @@ class PlantServer:
         self._receiver = Receiver(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
         self._patient = _Body(run)
         self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name)
-        self._last_glucose: float | None = None
         self._pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
         self._outbox: list[Frame] = []
         self._echoes: dict[int, int] = {}
@@ -186,8 +185,9 @@ class PlantServer:
         frame = self._transmitter.frame
         frames = self._outbox
         self._outbox = []
-        frames.append(self._read_sensor())
-        frames += self._pump.report(self.step, self._transmitter)
+        frames += self._read_sensor()
+        frames += self._confirm_pump_alarms()
+        frames += self._pump.report(self._transmitter)
         toggle = self.step & 1
         frames.append(frame("HB_PUMP", NmtPump=5, TogglePump=toggle, ResetCausePump=0, BootPump=0))
         frames.append(frame("HB_CGM", NmtCgm=5, ToggleCgm=toggle, ResetCauseCgm=0, BootCgm=0))
@@ -199,27 +199,41 @@ class PlantServer:
 
     def _advance(self) -> None:
         insulin, pramlintide = self._pump.deliver(self.step)
-        for motor in (self._pump.insulin, self._pump.pramlintide):
-            if not mechanism.ledger_closes(motor):
-                raise PlantError(f"the pump's ledger does not close in step {self.step}: {motor.tolist()}")
+        for chamber in (self._pump.insulin, self._pump.pramlintide):
+            if not mechanism.ledger_closes(chamber.words):
+                raise PlantError(f"the pump's ledger does not close in step {self.step}: {chamber.words.tolist()}")
         self._patient.advance(self.step, insulin, pramlintide)
         self.step += 1
 
-    def _read_sensor(self) -> Frame:
+    def _read_sensor(self) -> list[Frame]:
+        frames = []
         sample = self._sensor.sample(self.step, self._patient.interstitial)
-        rate = RATE_UNKNOWN
-        if self._last_glucose is not None:
-            rate = round((sample.glucose - self._last_glucose) / 5 * 100)
-            rate = min(max(rate, -1020), 1020)
-        self._last_glucose = sample.glucose if sample.state == STATE_OK else None
-        return self._transmitter.frame(
-            "CGM_Reading",
-            CgmState=sample.state,
-            GlucoseConc=round(sample.glucose * 10),
-            GlucoseRate=rate,
-            CgmSampleSeq=self.step % 65535,
-            CgmSampleStep=self.step % 256,
-        )
+        if sample is not None:
+            rate = RATE_UNKNOWN if sample.rate is None else min(max(round(sample.rate * 100), -1020), 1020)
+            frames.append(
+                self._transmitter.frame(
+                    "CGM_Reading",
+                    CgmState=sample.state,
+                    GlucoseConc=GLUCOSE_UNKNOWN if sample.glucose is None else round(sample.glucose * 10),
+                    GlucoseRate=rate,
+                    CgmSampleSeq=sample.number,
+                    CgmSampleStep=self.step % 256,
+                )
+            )
+        status = self._sensor.status(self.step)
+        if status is not None:
+            frames.append(
+                self._transmitter.frame(
+                    "CGM_Status",
+                    CgmFaultBits=status.fault_bits,
+                    CgmSessionId=status.session,
+                    CgmSensorAge=min(status.age_minutes, 65533),
+                    CgmNoise=min(round(status.noise * 2), 252),
+                    CgmBattery=round(status.battery * 2),
+                    CgmDropCount=status.dropped % 255,
+                )
+            )
+        return frames
 
     def _confirm(self, alarm: dict[str, int]) -> None:
         """The user reads every alarm and confirms it."""
@@ -229,6 +243,16 @@ class PlantServer:
                     "UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"]
                 )
             )
+
+    def _confirm_pump_alarms(self) -> list[Frame]:
+        """The user confirms what the pump has shown since the last step."""
+        frames = []
+        for instance in self._pump.pending_alarms():
+            self._pump.acknowledge(instance)
+            frames.append(
+                self._transmitter.frame("UI_AlarmAck", AlarmAckNode=2, AlarmAckAction=1, AlarmAckInstance=instance)
+            )
+        return frames
 
     def _tell_truth(self) -> list[Frame]:
         body, pump = self._patient, self._pump
@@ -246,8 +270,8 @@ class PlantServer:
                 "TruthRa": _raw(body.rate_of_appearance, 0.001),
                 "TruthMealCarbs": _raw(body.carbs_starting(self.step), 0.02),
             },
-            _ledger("Insulin", pump.insulin),
-            _ledger("Pram", pump.pramlintide),
+            _ledger("Insulin", pump.insulin.words),
+            _ledger("Pram", pump.pramlintide.words),
         ]
         return [
             self._transmitter.frame("PLANT_Truth", TruthSel=page, TruthStep=self.step % 65536, **values)
