@@ -117,5 +117,5 @@ class Chamber:
     def change(self) -> None:
         """The user changes reservoir and line: full again, primed, without air or occlusion."""
         self.release(lost=True)
-        self.words[FLUID] = self.settings.capacity - self.settings.priming
+        self.words[FLUID] = max(self.settings.capacity - self.settings.priming, 0)
         self.words[AIR] = 0
