@@ -30,6 +30,9 @@ GLUCOSE_UNKNOWN, RATE_UNKNOWN = 8191, -1024
 
 ALARM_PENDING = 1
 
+NMT_BOOT_UP, NMT_OPERATIONAL = 0, 5
+"""HB_PUMP.NmtPump and HB_CGM.NmtCgm, as CANopen numbers them."""
+
 
 class PlantError(RuntimeError):
     """The device broke the protocol or refused to run; the text says what it did and what was expected."""
@@ -147,6 +150,8 @@ class PlantServer:
         frame = self._transmitter.frame
         self._phase = Phase.CONFIG
         return [
+            frame("HB_PUMP", NmtPump=NMT_BOOT_UP, TogglePump=1, ResetCausePump=0, BootPump=0),
+            frame("HB_CGM", NmtCgm=NMT_BOOT_UP, ToggleCgm=1, ResetCauseCgm=0, BootCgm=0),
             *(
                 frame("CFG_Param", CfgIndex=index, **{names[index][0].name: raw})
                 for index, raw in self.run.calibration.items()
@@ -189,8 +194,8 @@ class PlantServer:
         frames += self._confirm_pump_alarms()
         frames += self._pump.report(self._transmitter)
         toggle = self.step & 1
-        frames.append(frame("HB_PUMP", NmtPump=5, TogglePump=toggle, ResetCausePump=0, BootPump=0))
-        frames.append(frame("HB_CGM", NmtCgm=5, ToggleCgm=toggle, ResetCauseCgm=0, BootCgm=0))
+        frames.append(frame("HB_PUMP", NmtPump=NMT_OPERATIONAL, TogglePump=toggle, ResetCausePump=0, BootPump=0))
+        frames.append(frame("HB_CGM", NmtCgm=NMT_OPERATIONAL, ToggleCgm=toggle, ResetCauseCgm=0, BootCgm=0))
         frames += self._tell_truth()
         frames.append(frame("SYNC_Step", SyncPhase=self._phase, StepIndex=self.step, SimTime=self.step * STEP_SECONDS))
         return frames
