@@ -215,26 +215,33 @@ def test_status_of_a_failure_and_of_a_signal(tmp_path, script, status):
 
 
 def test_killed_it_leaves_nothing(tmp_path):
-    """By SIGTERM, which the command hears of and may answer, and by SIGKILL, which nobody hears of."""
+    """By signals which the command hears of and may answer, also as a Ctrl-C to all of us, and by SIGKILL."""
     calls = {}
-    script = 'trap "echo heard > heard; trap - TERM; kill -TERM $$" TERM; echo up; while :; do sleep 0.1; done'
-    for number in (signal.SIGTERM, signal.SIGKILL):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGKILL):
         cwd, tmp = tmp_path / number.name, tmp_path / f"{number.name}-tmp"
         cwd.mkdir()
         tmp.mkdir()
-        call = subprocess.Popen(
-            [TOOL, "sh", "-c", script], cwd=cwd, env=environment(TMPDIR=tmp), stdout=subprocess.PIPE
-        )
-        calls[number] = call, cwd, tmp
-    for number, (call, cwd, tmp) in calls.items():
-        with call:
+        name = number.name.removeprefix("SIG")
+        trap = "" if name == "KILL" else f'trap "echo heard; echo > heard; trap - {name}; kill -{name} $$" {name}; '
+        calls[number] = cwd, tmp, subprocess.Popen(
+            [TOOL, "sh", "-c", trap + "echo up; while :; do sleep 0.1; done"],
+            cwd=cwd, env=environment(TMPDIR=tmp), stdout=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+    try:
+        for number, (cwd, tmp, call) in calls.items():
             assert call.stdout.readline() == b"up\n"
-            if number == signal.SIGTERM and not os.environ.get("VCAN_GUEST") and list(tmp.iterdir()):
+            if list(tmp.iterdir()):  # so it is in a guest
                 assert any("linux.uml" in line for line in processes(tmp)), "or this test would see nothing"
-            call.send_signal(number)
+            (os.killpg if number == signal.SIGINT else os.kill)(call.pid, number)
             assert call.wait(15) == -number
-        assert left_behind(tmp) == []
-        assert (cwd / "heard").exists() == (number == signal.SIGTERM)
+            answer = b"" if number == signal.SIGKILL else b"heard\n"
+            assert call.stdout.read() == answer
+            assert left_behind(tmp) == []
+            assert (cwd / "heard").exists() == bool(answer)
+    finally:
+        for _, _, call in calls.values():
+            with call:
+                call.kill()
 
 
 def test_timeout(tmp_path):
