@@ -9,7 +9,7 @@ GLUCOSE_LOW, GLUCOSE_HIGH = 200, 8000
 """0.1 mg/dL: what a sensor in state Ok may say (project's choice, requirement SEN-04)."""
 
 BELOW_RANGE_ACTS_AS, ABOVE_RANGE_ACTS_AS = 400, 4000
-"""0.1 mg/dL (requirement SEN-05)."""
+"""0.1 mg/dL (requirement SEN-05); below range suspends besides, for 40 is only where the sensor's scale ends."""
 
 AGE_USABLE = 3
 """Steps: a sample older than this is not used at all (15 min; requirement SEN-01)."""
@@ -40,6 +40,8 @@ class Cgm:
     def __init__(self) -> None:
         self._sequence: int | None = None
         self._taken: int | None = None  # step of the newest usable sample
+        self.below_range = False  # the newest usable sample says only that glucose is very low
+        self._skipped = 0  # frames in this step that E2E did not allow to read
         self._unused = 0  # frames since the newest usable sample that came and could not be used
         self.streak = 0  # steps in a row with a usable sample
         self.since_gap = 0  # usable samples since the last gap longer than AGE_USABLE
@@ -59,8 +61,11 @@ class Cgm:
         return self.since_gap < SETTLING_SAMPLES
 
     def skip(self) -> None:
-        """A frame came that E2E does not allow to read: its sample is unused, not lost."""
-        self._unused += 1
+        """A frame came that E2E does not allow to read.
+
+        After a gap it is a sample, unused but not lost; beside a usable sample it is a copy.
+        """
+        self._skipped += 1
 
     def judge(self, samples: list[dict[str, int]], step: int) -> Verdict:
         """Take the CGM_Reading frames that arrived for instant `step` (checked by E2E before)."""
@@ -83,8 +88,12 @@ class Cgm:
             self._unused = 0
             self._sequence = number
             self._taken = step - age
+            self.below_range = sample["CgmState"] == STATE_BELOW_RANGE
             verdict.glucose = glucose
+        skipped = self._skipped
+        self._skipped = 0
         if verdict.glucose < 0:
+            self._unused += skipped
             self.streak = 0
         else:
             self.streak += 1

@@ -107,7 +107,7 @@ class Firmware:
         """Take one frame; only a token is answered."""
         check, name, values, _ = self._receiver.receive(frame)
         if check > Check.OK_SOME_LOST:
-            if check == Check.WRONG_SEQUENCE and name == "CGM_Reading":
+            if check in (Check.REPEATED, Check.WRONG_SEQUENCE) and name == "CGM_Reading":
                 self._cgm.skip()
             return ()
         if name == "SYNC_Step":
@@ -229,10 +229,10 @@ class Firmware:
         inputs[layout.IN_DELIVERED] = delivered
         inputs[layout.IN_MODE] = self._mode
         inputs[layout.IN_RESET] = 1 if self._cgm.settling else 0
-        if state == State.AUTO:
-            inputs[layout.IN_LIMIT] = layout.LIMIT_NONE
-        elif state == State.SUSPENDED:
+        if state == State.SUSPENDED or self._cgm.below_range:
             inputs[layout.IN_LIMIT] = layout.LIMIT_SUSPEND
+        elif state == State.AUTO:
+            inputs[layout.IN_LIMIT] = layout.LIMIT_NONE
         else:
             inputs[layout.IN_LIMIT] = layout.LIMIT_SCHEDULE
         if self._calibration.active:
