@@ -57,6 +57,7 @@ class Inputs:
     glucose: list[float] = field(default_factory=list)  # mg/dL
     total: list[float] = field(default_factory=list)  # U delivered since the start
     limit: list[int] = field(default_factory=list)
+    below_range: list[bool] = field(default_factory=list)  # suspends, whatever the ladder says
 
 
 class Oracle:
@@ -151,6 +152,7 @@ class Loop:
             values = message.unpack(frame.data)
             out_of_range = {4: 40.0, 5: 400.0}
             self.inputs.glucose.append(out_of_range.get(values["CgmState"], values["GlucoseConc"] * 0.1))
+            self.inputs.below_range.append(values["CgmState"] == 4)
         elif message.name == "PUMP_Delivered":
             self.inputs.total.append(message.unpack(frame.data)["InsulinTotal"] * 0.001)
 
@@ -164,7 +166,8 @@ class Loop:
             self.demand.append(firmware._outputs[layout.OUT_DEMAND] / 65536 * INSULIN_LSB)
         elif message.name == "CTRL_Status":
             state = message.unpack(frame.data)["CtrlState"]
-            self.inputs.limit.append({State.AUTO: 0, State.SUSPENDED: 2}.get(State(state), 1))
+            limit = {State.AUTO: 0, State.SUSPENDED: 2}.get(State(state), 1)
+            self.inputs.limit.append(2 if self.inputs.below_range[-1] else limit)
         elif message.name == "CTRL_Diag":
             self.diag = message.unpack(frame.data)
 
