@@ -25,6 +25,9 @@ AGE_SCHEDULE = 7
 """Steps: from this age on nothing but the schedule, and no pramlintide (H4)."""
 
 SET_RATE, SUSPEND, RESUME_SCHEDULE = 1, 2, 3
+STATE_SUSPENDED = 4
+"""CTRL_Status.CtrlState: the user has suspended."""
+
 CGM_LOST = 1
 CFG_BASAL, CFG_MAX_BASAL = 0, 3
 ALARM_INACTIVE = 0
@@ -50,6 +53,7 @@ class Monitor:
         self._basal = 0  # 0.001 U/h
         self._max_basal = 0
         self._used: int | None = None
+        self._state: int | None = None
         self._lost_alarm = False
         self._totals: dict[str, int] | None = None
         self._phase: int = Phase.INIT
@@ -112,6 +116,7 @@ class Monitor:
 
     def _on_ctrl_status(self, values: dict[str, int]) -> None:
         self._used = values["LastCgmSeq"]
+        self._state = values["CtrlState"]
         self.limiter_steps += values["LimiterBits"] != 0
 
     def _on_ctrl_diag(self, values: dict[str, int]) -> None:
@@ -142,6 +147,8 @@ class Monitor:
 
     def _judge_command(self, command: dict[str, int], age: int) -> None:
         operation, rate, pramlintide = command["BasalOp"], command["InsulinRate"], command["PramlintideRate"]
+        if operation == SUSPEND and age >= AGE_SCHEDULE and self._state != STATE_SUSPENDED:
+            self.hazards["H4"] += 1
         if operation != SET_RATE:
             return
         ceiling = max(self._max_basal, self._basal)

@@ -1,0 +1,318 @@
+"""The independent watch: silent over clean runs, and counting every hazard that is written into the frames."""
+
+from collections import deque
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+from bench import S2, Bench, calibration
+from pumpbench.calibration import MODES
+from pumpbench.hazards import Monitor
+
+import firmware_sim.ladder
+from can_bus import codec
+from can_bus.frame import Frame
+from can_bus.lockstep import Done, Phase
+from firmware_sim.firmware import Firmware
+from firmware_sim.ladder import State
+from plant_server.physiology import load_patient
+from plant_server.scenario import load_scenario
+from plant_server.server import PlantServer, Run
+
+Tamper = Callable[[str, dict[str, int], int], bool]
+"""Message name, its values, step -> whether the frame gets lost on its way to the device."""
+
+COUNTED = ("H2", "H3", "H4", "H6", "H7")
+
+
+def keep(_name: str, _values: dict[str, int], _step: int) -> bool:
+    return False
+
+
+def closed_loop(steps: int, lose: Tamper = keep, strategy: str = "s2") -> list[Frame]:
+    """The device's bus over a run of plant and firmware."""
+    patient = load_patient("adult#001")
+    flash = calibration("adult#001")
+    plant = PlantServer(Run(patient, load_scenario("validation-14d"), steps, 5, MODES[strategy], flash))
+    firmware, log = Firmware(), []
+    to_device = deque(plant.call_roll())
+    while not plant.finished:
+        answers = []
+        for frame in to_device:
+            message = codec.messages_by_id()[frame.can_id]
+            if not lose(message.name, message.unpack(frame.data), plant.step):
+                log.append(frame)
+                answers += firmware.receive(frame)
+        to_device.clear()
+        for frame in answers:
+            log.append(frame)
+            to_device += plant.receive(frame)
+    return log
+
+
+@cache
+def clean() -> tuple[Frame, ...]:
+    return tuple(closed_loop(150))
+
+
+def watched(frames: list[Frame] | tuple[Frame, ...]) -> dict[str, int]:
+    monitor = Monitor()
+    monitor.watch(frames)
+    assert tuple(monitor.hazards) == COUNTED
+    return monitor.hazards
+
+
+def none_but(**expected: int) -> dict[str, int]:
+    return dict.fromkeys(COUNTED, 0) | expected
+
+
+def changed(frame: Frame, **values: int) -> Frame:
+    """The same frame with other values, its counter kept and its CRC repaired."""
+    message = codec.messages_by_id()[frame.can_id]
+    word = int.from_bytes(frame.data, "little")
+    for name, value in values.items():
+        field = message.fields[name]
+        word = word & ~(field.mask << field.shift) | (value & field.mask) << field.shift
+    if not message.data_ids:
+        return frame._replace(data=word.to_bytes(message.length, "little"))
+    return frame._replace(data=codec.protect(message, word & ~0xFFF, frame.data[1] & 0xF))
+
+
+def doctored(name: str, nth: int, where: Callable[[dict[str, int]], bool] = bool, **values: int) -> list[Frame]:
+    """The clean run with one frame changed: the nth of this message, of those that fit."""
+    frames = list(clean())
+    message = codec.message(name)
+    places = [i for i, f in enumerate(frames) if f.can_id == message.can_id and where(message.unpack(f.data))]
+    frames[places[nth]] = changed(frames[places[nth]], **values)
+    return frames
+
+
+# ---- nothing where nothing is
+
+
+@pytest.mark.parametrize("strategy", ["nma", "s2"])
+def test_a_clean_run_has_no_hazard(strategy: str) -> None:
+    assert watched(closed_loop(288, strategy=strategy)) == none_but()
+
+
+@pytest.mark.parametrize(
+    "name", ["CGM_Reading", "PUMP_Status", "PUMP_Delivered", "HB_CGM", "HB_PUMP", "PUMP_Ack", "UI_AlarmAck"]
+)
+@pytest.mark.parametrize("length", [1, 3, 4, 8, 16, 17, 40])
+def test_lost_frames_of_any_message_are_no_hazard_to_this_firmware(name: str, length: int) -> None:
+    assert watched(closed_loop(110, lambda n, _values, step: n == name and 40 <= step < 40 + length)) == none_but()
+
+
+def test_sensor_and_pump_lost_together_are_no_hazard_either() -> None:
+    def lose(name: str, _values: dict[str, int], step: int) -> bool:
+        return name in ("CGM_Reading", "PUMP_Status", "PUMP_Delivered") and 40 <= step < 70
+
+    assert watched(closed_loop(110, lose)) == none_but()
+
+
+def test_a_user_who_suspends_is_no_hazard() -> None:
+    bench = Bench(mode=S2)
+    bench.run(10, 2000)
+    bench.send("MODE_Cmd", ModeRequest=S2, ModeCmdSeq=1, SuspendRequest=1)
+    for _ in range(12):
+        assert bench.step(drop=True).state == State.SUSPENDED
+    assert watched(bench.log) == none_but()
+
+
+def test_fields_the_monitor_cannot_read_do_not_stop_it() -> None:
+    for phase in range(16):
+        assert watched(doctored("SYNC_Step", 50, SyncPhase=phase))["H2"] == 0
+
+
+# ---- one hazard, one count
+
+
+def test_h2_a_rate_above_the_limit() -> None:
+    assert watched(doctored("PUMP_BasalCmd", 50, InsulinRate=6001)) == none_but(H2=1)
+    assert watched(doctored("PUMP_BasalCmd", 50, InsulinRate=6000)) == none_but()
+
+
+@pytest.mark.parametrize("raw", [8001, 8190, 8191])
+def test_h2_a_reserved_code(raw: int) -> None:
+    assert watched(doctored("PUMP_BasalCmd", 50, InsulinRate=raw)) == none_but(H2=1)
+    assert watched(doctored("PUMP_BasalCmd", 50, PramlintideRate=raw)) == none_but(H2=1)
+
+
+def test_h3_a_sample_that_never_came() -> None:
+    assert watched(doctored("CTRL_Status", 50, LastCgmSeq=999)) == none_but(H3=1)
+    assert watched(doctored("CTRL_Status", 50, LastCgmSeq=51)) == none_but(H3=1)  # the one of the next step
+
+
+@pytest.mark.parametrize(
+    "values", [{"CgmState": 6}, {"CgmState": 0}, {"GlucoseConc": 199}, {"GlucoseConc": 8191}, {"CgmSampleStep": 51}]
+)
+def test_h3_a_sample_that_must_not_be_used(values: dict[str, int]) -> None:
+    """Step 50 says it used its sample; what came could not be used."""
+    assert watched(doctored("CGM_Reading", 50, **values)) == none_but(H3=1)
+
+
+def test_h3_a_sample_whose_crc_was_wrong() -> None:
+    sample = codec.message("CGM_Reading")
+    frames = list(clean())
+    place = [i for i, frame in enumerate(frames) if frame.can_id == sample.can_id][50]
+    data = frames[place].data
+    frames[place] = frames[place]._replace(data=data[:7] + bytes([data[7] ^ 1]))
+    assert watched(frames)["H3"] == 1
+
+
+def test_h4_pramlintide_without_insulin() -> None:
+    assert watched(doctored("PUMP_BasalCmd", 50, InsulinRate=0, PramlintideRate=1)) == none_but(H4=1)
+    assert watched(doctored("PUMP_BasalCmd", 50, InsulinRate=0, PramlintideRate=0)) == none_but()
+
+
+def stale(lost: int) -> tuple[list[Frame], list[int]]:
+    """A run whose sensor is gone from step 40 on, and where its commands of steps 40 and later are."""
+    frames = closed_loop(60, lambda name, _values, step: name == "CGM_Reading" and 40 <= step < 40 + lost)
+    places = [i for i, frame in enumerate(frames) if frame.can_id == codec.message("PUMP_BasalCmd").can_id]
+    return frames, places[40:]
+
+
+@pytest.mark.parametrize("age", range(1, 12))
+def test_h4_above_the_schedule_on_a_stale_sample(age: int) -> None:
+    frames, places = stale(19)
+    basal = calibration()[0]
+    for rate, above in ((basal // 5, False), (basal // 5 + 1, True)):
+        frames[places[age - 1]] = changed(
+            frames[places[age - 1]], BasalOp=1, InsulinRate=rate, PramlintideRate=0, BasalUntilStep=0
+        )
+        expected = 0 if not above or age <= 3 else 1 if age < 7 else 2  # above, and not the schedule
+        assert watched(frames)["H4"] == expected
+
+
+@pytest.mark.parametrize(
+    ("values", "age", "count"),
+    [
+        ({"BasalOp": 1, "InsulinRate": 0, "PramlintideRate": 0}, 7, 1),
+        ({"BasalOp": 1, "InsulinRate": 0, "PramlintideRate": 0}, 6, 0),
+        ({"BasalOp": 1, "InsulinRate": 284, "PramlintideRate": 0}, 9, 1),
+        ({"BasalOp": 1, "InsulinRate": 285, "PramlintideRate": 5}, 9, 1),
+        ({"BasalOp": 1, "InsulinRate": 285, "PramlintideRate": 0}, 9, 0),
+        ({"BasalOp": 2}, 9, 1),
+        ({"BasalOp": 2}, 6, 0),
+        ({"BasalOp": 3}, 9, 0),
+    ],
+)
+def test_h4_anything_but_the_schedule_after_half_an_hour(values: dict[str, int], age: int, count: int) -> None:
+    assert calibration()[0] // 5 == 285
+    frames, places = stale(19)
+    frames[places[age - 1]] = changed(frames[places[age - 1]], **values)
+    assert watched(frames)["H4"] == count
+
+
+def test_h4_dosing_before_any_sample() -> None:
+    frames = closed_loop(10, lambda name, _values, _step: name == "CGM_Reading")
+    assert watched(frames) == none_but()
+    place = next(i for i, frame in enumerate(frames) if frame.can_id == codec.message("PUMP_BasalCmd").can_id)
+    frames[place] = changed(frames[place], BasalOp=1, InsulinRate=400, PramlintideRate=0)
+    assert watched(frames)["H4"] == 2  # above the schedule, and not the schedule
+
+
+@pytest.mark.parametrize(
+    ("page", "values"),
+    [
+        (4, {"TruthInsulinCommanded": 60000}),
+        (4, {"TruthInsulinPending": 9000}),
+        (4, {"TruthInsulinLost": 9000}),
+        (5, {"TruthPramCommanded": 60000}),
+        (5, {"TruthPramPending": 9000}),
+        (5, {"TruthPramLost": 9000}),
+    ],
+)
+def test_h6_a_stroke_that_is_not_accounted_for(page: int, values: dict[str, int]) -> None:
+    frames = doctored("PLANT_Truth", 60, where=lambda truth: truth["TruthSel"] == page, **values)
+    assert watched(frames) == none_but(H6=1)
+
+
+def test_h6_totals_that_are_no_whole_strokes() -> None:
+    delivered = codec.message("PUMP_Delivered")
+    total = [delivered.unpack(f.data)["InsulinTotal"] for f in clean() if f.can_id == delivered.can_id][60]
+    assert watched(doctored("PUMP_Delivered", 60, InsulinTotal=total + 1)) == none_but(H6=1)
+    assert watched(doctored("PUMP_Delivered", 60, InsulinTotal=total + 50)) == none_but(H6=1)
+
+
+def test_h6_is_not_judged_without_the_totals_of_the_step() -> None:
+    can_id = codec.message("PUMP_Delivered").can_id
+    frames = list(clean())
+    places = [i for i, frame in enumerate(frames) if frame.can_id == can_id]
+    del frames[places[60]]
+    assert watched(frames) == none_but()
+
+
+def test_h7_a_lost_sensor_without_an_alarm() -> None:
+    alarm = codec.message("CTRL_Alarm").can_id
+    frames, _ = stale(10)
+    assert watched(frames) == none_but()
+    silent = [frame for frame in frames if frame.can_id != alarm]
+    assert watched(silent)["H7"] == 7  # ages 5 to 10, and the first sample again was refused for its counter
+
+
+def test_h7_an_alarm_that_ends_too_early() -> None:
+    alarm = codec.message("CTRL_Alarm")
+    frames, _ = stale(10)
+    first = next(i for i, frame in enumerate(frames) if frame.can_id == alarm.can_id)
+    rest = [frame for frame in frames[first + 1 :] if frame.can_id != alarm.can_id]
+    assert watched(frames[: first + 1] + rest) == none_but()  # it was raised, and never ended
+    ended = [*frames[:first], changed(frames[first], CtrlAlarmState=0), *rest]
+    assert watched(ended)["H7"] == 7
+
+
+# ---- a firmware that is wrong
+
+
+def test_a_firmware_that_goes_down_too_late_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(firmware_sim.ladder, "AGE_DEGRADED", 6)
+    monkeypatch.setattr(firmware_sim.firmware, "AGE_DEGRADED", 6)
+    bench = Bench(mode=S2)
+    bench.run(24, 2500)
+    for _ in range(12):
+        bench.step(drop=True)
+    assert watched(bench.log) == none_but(H4=2, H7=1)
+
+
+def test_a_firmware_that_takes_old_samples_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(firmware_sim.cgm, "AGE_USABLE", 5)
+    bench = Bench(mode=S2)
+    bench.run(24, 2500)
+    for _ in range(3):
+        old = {"CgmSampleStep": (bench.k - 5) % 256}
+        bench.step(cgm=[bench.sample(2500, **old)])
+    assert watched(bench.log)["H3"] == 3
+
+
+def test_a_step_in_several_turns_is_judged_once_at_its_end() -> None:
+    """The device asks for further turns: its command may come in any of them."""
+    frames = []
+    plant, device = codec.Transmitter(), codec.Transmitter()
+    for frame in clean():
+        name = codec.messages_by_id()[frame.can_id].name
+        values = codec.message(name).unpack(frame.data)
+        if name == "SYNC_Step":
+            step = values["StepIndex"]
+            frames.append(plant.frame(name, **values))
+            if values["SyncPhase"] == Phase.STEP:
+                frames.append(device.frame("SYNC_Done", DoneStatus=Done.CONTINUE, DoneStepIndex=step, TxCount=1))
+                frames.append(
+                    plant.frame(name, SyncPhase=Phase.CONTINUE, StepIndex=step, SimTime=values["SimTime"] + 1)
+                )
+        else:
+            frames.append(device.frame(name, **values) if name == "SYNC_Done" else frame)
+    assert watched(frames) == none_but()
+    place = [i for i, frame in enumerate(frames) if frame.can_id == codec.message("PUMP_BasalCmd").can_id][50]
+    frames[place] = changed(frames[place], InsulinRate=6001)
+    assert watched(frames) == none_but(H2=1)
+
+
+def test_the_safety_part_repeats_the_devices_own_counts() -> None:
+    monitor = Monitor()
+    monitor.watch(closed_loop(60, lambda name, _values, step: name == "CGM_Reading" and step in (20, 30, 31)))
+    safety = monitor.safety({"closes": True})
+    assert safety["frames_lost"] == 3
+    assert safety["e2e_errors"] == safety["sequence_errors"] == safety["saturations"] == 0
+    assert safety["ledger"] == {"closes": True}
+    # what this bench cannot yet observe is not known, which is not the same as none
+    assert safety["hazards"] == {"H1": None, "H5": None, "H8": None} | none_but()
