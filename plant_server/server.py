@@ -19,7 +19,7 @@ from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
 from . import mechanism, physiology
 from .physiology import Patient, Variability
 from .pump import Pump, PumpSettings
-from .scenario import EATING_MINUTES, Scenario
+from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
 from .sensor import Sensor, SensorSettings
 
 PMOL_PER_L_PER_MU_PER_L = 6.0
@@ -187,6 +187,8 @@ class PlantServer:
         last = self.step == self.run.steps
         self._phase = Phase.END if last else Phase.STEP
         self._turns = 0
+        if not last:
+            self._patient.feel(self.step)
         frame = self._transmitter.frame
         frames = self._outbox
         self._outbox = []
@@ -311,19 +313,25 @@ class _Body:
         self._variability = Variability(run.seed, run.patient.name, run.variability)
         self._p = self._variability.apply(self._nominal)
         self._meals = run.scenario.meals_by_step()
-        self._carbs = self._eating_plan(run)
+        self._rescuer = Rescuer(run.scenario.rescue) if run.scenario.rescue else None
+        self._carbs = np.zeros((run.steps, mechanism.SUBSTEPS))  # mg eaten in every 30-s step of the run
+        for meal in run.scenario.meals:
+            self._eat(meal, EATING_MINUTES)
         self._meal_index = 0
 
-    @staticmethod
-    def _eating_plan(run: Run) -> np.ndarray:
-        """Carbohydrate in mg eaten in every 30-s step of the run."""
-        plan = np.zeros((run.steps, mechanism.SUBSTEPS))
-        flat = plan.reshape(-1)
-        substeps = int(EATING_MINUTES / physiology.STEP_MIN)
-        for meal in run.scenario.meals:
-            start = meal.step * mechanism.SUBSTEPS
-            flat[start : start + substeps] += meal.carbs_g * 1000 / substeps
-        return plan
+    def _eat(self, meal: Meal, minutes: int) -> None:
+        """Put a meal on the table; it is eaten evenly over `minutes`."""
+        substeps = int(minutes / physiology.STEP_MIN)
+        start = meal.step * mechanism.SUBSTEPS
+        self._carbs.reshape(-1)[start : start + substeps] += meal.carbs_g * 1000 / substeps
+
+    def feel(self, step: int) -> None:
+        """Eat sugar at this instant if glucose has been low for long enough."""
+        carbs = self._rescuer.carbs(step, self.glucose) if self._rescuer else 0.0
+        if carbs:
+            meal = Meal(step, RESCUE, carbs)
+            self._meals.setdefault(step, []).append(meal)
+            self._eat(meal, RESCUE_EATING_MINUTES)
 
     def carbs_starting(self, step: int) -> float:
         """Carbohydrate (g) of the meals that start at this instant."""
@@ -332,8 +340,9 @@ class _Body:
     def advance(self, step: int, insulin: np.ndarray, pramlintide: np.ndarray) -> None:
         """Integrate from instant `step` to the next one."""
         for meal in self._meals.get(step, ()):
-            self._p = self._variability.apply(self._nominal, self._variability.meal(self._meal_index), out=self._p)
-            self._meal_index += 1
+            if meal.kind != RESCUE:  # sugar shifts no planned meal's random numbers
+                self._p = self._variability.apply(self._nominal, self._variability.meal(self._meal_index), out=self._p)
+                self._meal_index += 1
             physiology.begin_meal(self._x, self._p, meal.carbs_g * 1000)
         physiology.advance(self._x, self._p, float(step * STEP_SECONDS // 60), insulin, pramlintide, self._carbs[step])
 

@@ -25,6 +25,10 @@ console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+SCENARIOS = "validation-14d, tuning, camerlingo, fasting, or a YAML or CSV file."
+SENSORS = "coloured, ideal, breton, facchinetti, dexcom-g5, dexcom-g6, vettoretti, or a YAML file."
+
+
 class Strategy(StrEnum):
     """The modes of the paper this build knows."""
 
@@ -57,7 +61,7 @@ def _common(
 def run(
     patient: Annotated[str, typer.Option(help="One name, a comma list, or all; or file.csv#name.")] = "adult#001",
     strategy: Annotated[Strategy, typer.Option(help="Mode of the controller.")] = Strategy.S2,
-    scenario: Annotated[str, typer.Option(help="validation-14d, fasting, or a YAML or CSV file.")] = "validation-14d",
+    scenario: Annotated[str, typer.Option(help=SCENARIOS)] = "validation-14d",
     days: Annotated[float, typer.Option(help="Simulated days; rounded to steps of 5 min.", min=0.0)] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 1,
     bus: Annotated[
@@ -74,7 +78,7 @@ def run(
     firmware: Annotated[
         str | None, typer.Option(help='Command that starts another firmware; "{bus}" becomes the bus URL.')
     ] = None,
-    sensor: Annotated[str, typer.Option(help="coloured, breton or ideal.")] = "coloured",
+    sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
     out: Annotated[Path | None, typer.Option(help="Run folder to write (default: below runs/).")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing run folder at --out.")] = False,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware's first answer.")] = 20.0,
@@ -202,10 +206,10 @@ def plant(
     host: Annotated[bool, typer.Option(help="Serve that URL as a hub, from this process.")] = False,
     patient: Annotated[str, typer.Option(help="Name of the virtual patient.")] = "adult#001",
     strategy: Annotated[Strategy, typer.Option(help="Mode to ask the firmware for.")] = Strategy.S2,
-    scenario: Annotated[str, typer.Option(help="validation-14d, fasting, or a file.")] = "validation-14d",
+    scenario: Annotated[str, typer.Option(help=SCENARIOS)] = "validation-14d",
     days: Annotated[float, typer.Option(help="Simulated days.", min=0.0)] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 1,
-    sensor: Annotated[str, typer.Option(help="coloured, breton or ideal.")] = "coloured",
+    sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for a firmware.")] = 60.0,
     step_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware in a step.")] = 10.0,
 ) -> None:

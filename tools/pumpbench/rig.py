@@ -36,6 +36,7 @@ from can_bus.lockstep import Node
 from can_bus.url import open_link
 from plant_server.physiology import load_patient
 from plant_server.scenario import load_scenario
+from plant_server.sensor import load_sensor
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
 from pumpbench import __version__
@@ -106,17 +107,18 @@ def prepare(request: Request) -> Prepared:
     if request.bus == "inproc" and request.firmware:
         raise RigError("--bus inproc runs the built-in firmware only; a --firmware command needs a bus, e.g. --bus hub")
     patient = load_patient(request.patient)
-    scenario = load_scenario(request.scenario)
+    scenario = load_scenario(
+        request.scenario, seed=request.seed, patient=patient.name, days=request.steps / STEPS_PER_DAY
+    )
     if request.steps > scenario.days * STEPS_PER_DAY:
         raise RigError(
             f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
         )
     faults = load_faults(request.faults) if request.faults else ()
     calibration = calibrate(patient)
-    run = Run(
-        patient, scenario, request.steps, request.seed, MODES[request.strategy], calibration, sensor=request.sensor
-    )
-    PlantServer(run)  # checks the rest, e.g. the sensor
+    sensor = load_sensor(request.sensor)
+    run = Run(patient, scenario, request.steps, request.seed, MODES[request.strategy], calibration, sensor=sensor)
+    PlantServer(run)  # checks the rest
     info = {
         "pumpbench": __version__,
         "protocol": ".".join(map(str, dbc.protocol_version())),
@@ -135,7 +137,8 @@ def prepare(request: Request) -> Prepared:
         "faults": [fault.model_dump() for fault in faults],
         "parameters": {
             "patient_sha256": _sha256(patient.params.tobytes() + patient.x0.tobytes()),
-            "scenario_sha256": _sha256(repr(scenario.meals).encode()),
+            "scenario_sha256": _sha256(repr((scenario.meals, scenario.announcing, scenario.rescue)).encode()),
+            "sensor_sha256": _sha256(repr(sensor).encode()),
             "calibration_sha256": _sha256(repr(sorted(calibration.items())).encode()),
         },
     }
