@@ -1,4 +1,10 @@
-"""Outcome metrics of plasma glucose, over all samples of a run."""
+"""Outcome metrics of plasma glucose, over all samples of a run.
+
+Sources: ranges and targets, Battelino et al., Diabetes Care 2019;42:1593 (percent of *samples*); LBGI and HBGI,
+Kovatchev et al., Diabetes Care 1997;20:1655 and 2006;29:2433; GMI, Bergenstal et al., Diabetes Care 2018;41:2275; GRI,
+Klonoff et al., J Diabetes Sci Technol 2023;17:1226. A value on a limit counts as in range. The tests hold these
+functions against values worked by hand and against the packages iglu_python and py_agata.
+"""
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +18,10 @@ def risk(glucose: Array) -> tuple[float, float]:
     f(G) = 1.509 [(ln G)^1.084 - 5.381], risk = 10 f^2; LBGI is the mean over *all* samples of the risk where f < 0,
     HBGI where f > 0.
 
+    Some codes (simglucose's risk.py) take the mean over the samples of one side only; that is another number.
+
     Args:
-        glucose: mg/dL, all above 1.
+        glucose: mg/dL, none below 1.
     """
     f = 1.509 * (np.log(glucose) ** 1.084 - 5.381)
     r = 10 * f**2
@@ -29,7 +37,7 @@ def glycaemic(glucose: Array) -> dict[str, float]:
     """The outcome of one run.
 
     Args:
-        glucose: plasma glucose in mg/dL, one value per sampling instant.
+        glucose: plasma glucose in mg/dL, one value per sampling instant; for the risk, what is below 1 counts as 1.
 
     Returns:
         Percent of samples in range (70 to 180, both included), below 54 and 70, above 180 and 250; LBGI, HBGI; mean
