@@ -19,6 +19,7 @@ from can_bus.lockstep import STEP_SECONDS
 from .sensors import INSTANTS_PER_DAY, MODELS, SAMPLE_MINUTES, AnyModel, Wear
 from .sensors.coloured import Coloured
 from .sensors.effects import (
+    EFFECTS,
     STATE_ABOVE_RANGE,
     STATE_BELOW_RANGE,
     STATE_OK,
@@ -203,7 +204,8 @@ class Sensor:
         self._before: list[_Running] = []
         self._after: list[_Running] = []
         self._last_stages: list[_Running] = []
-        for effect in sorted(self.settings.effects, key=lambda effect: effect.stage):
+        order = list(EFFECTS)
+        for effect in sorted(self.settings.effects, key=lambda effect: (effect.stage, order.index(effect.kind))):
             numbers = effect.numbers(count, stream(seed, patient, f"cgm effect {effect.kind} {effect.name}"))
             self._place(effect).append(_Running(effect, numbers.tolist()))
         self._every = self.settings.sample_minutes // SAMPLE_MINUTES

@@ -1,5 +1,6 @@
 """The sensor around the model: range, age, what happens to it, what it says of itself, and its file."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -219,7 +220,13 @@ def test_drop_outs_at_random_have_their_share_and_length() -> None:
 
 
 def test_effects_act_in_the_order_of_the_signal_whatever_the_order_in_the_list() -> None:
-    effects = [Stuck(start="01:00"), Bias(offset=10), CompressionLow(start="00:00", end="23:00"), Noise(sd=3)]
+    effects = [
+        Stuck(start="01:00"),
+        Drift(gain_per_hour=0.1),
+        Bias(offset=10),
+        CompressionLow(end="23:00"),
+        Noise(sd=3),
+    ]
     forwards, backwards = shown(sensor(*effects)), shown(sensor(*reversed(effects)))
     assert np.array_equal(forwards, backwards)
     assert np.ptp(forwards[12:]) == 0
@@ -431,6 +438,12 @@ def test_a_wrong_file_is_one_clear_error(text: str, tmp_path: Path) -> None:
 def test_a_wrong_name_is_one_clear_error(name: str, text: str) -> None:
     with pytest.raises(SensorError, match=text.replace("?", r"\?")):
         Sensor(name, 10, 1, "adult#001")
+
+
+def test_effects_are_listed_in_the_order_in_which_they_act() -> None:
+    assert [effect.stage for effect in EFFECTS.values()] == sorted(effect.stage for effect in EFFECTS.values())
+    page = (Path(__file__).parents[1] / "docs" / "sensors-and-scenarios.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([a-z_]+)` \|", page.split("### Effects")[1].split("## ")[0], re.M) == list(EFFECTS)
 
 
 def test_effects_are_values_with_a_name() -> None:

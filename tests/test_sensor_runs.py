@@ -1,5 +1,6 @@
 """Sensors and scenarios in the closed loop, by the names that --sensor and --scenario take; nothing is written."""
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -112,3 +113,21 @@ def test_wrong_names_are_usage_errors(tmp_path: Path) -> None:
         prepared(tmp_path, scenario="tunning")
     for error in (SensorError("x"), ScenarioError("x")):
         assert cli._status(error) == cli.EXIT_USAGE
+
+
+PAGE = (Path(__file__).parents[1] / "docs" / "sensors-and-scenarios.md").read_text(encoding="utf-8")
+
+
+def test_the_page_has_every_sensor_and_scenario() -> None:
+    sensors, scenarios = PAGE.split("\n## Scenarios")
+    rows = r"^\| `([a-z0-9-]+)`"
+    assert re.findall(rows, sensors.split("### Effects")[0], re.M) == list(MODELS)
+    assert sorted(re.findall(rows, scenarios, re.M)) == sorted(built_in())
+
+
+@pytest.mark.parametrize("option", ["sensor", "scenario"])
+def test_the_pages_examples_run(option: str, tmp_path: Path) -> None:
+    example = next(text for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.S) if text.startswith(f"# {option}.yaml"))
+    file = tmp_path / f"{option}.yaml"
+    file.write_text(example)
+    play(prepared(tmp_path, **{option: str(file)}))

@@ -1,9 +1,10 @@
 """What can happen to a sensor besides the error of its model: effects with parameters and a window of simulated time.
 
-An effect is a value: it compares, prints, can be written in YAML, and does the same in every run. Effects stack,
-whatever their order in a list: first those of the tissue, then (after the model's error) the electrode's, the
-transmitter's and the radio's. Random ones draw one number per sampling instant of the whole run in advance, from a
-stream of their own named by kind and `name`: moving a window, or switching another effect off, shifts nothing.
+An effect is a value: it compares, prints, can be written in YAML, and does the same in every run. Effects stack in the
+order of `EFFECTS`, whatever their order in a list: first those of the tissue, then (after the model's error) the
+electrode's, the transmitter's and the radio's; several of one kind act in the order of the list. Random ones draw one
+number per sampling instant of the whole run in advance, from a stream of their own named by kind and `name`: moving a
+window, or switching another effect off, shifts nothing.
 
 Magnitudes are parameters; where a default is from a source it is named, the others are chosen for this project.
 """
@@ -322,11 +323,11 @@ EFFECTS: dict[str, type[Effect]] = {
     "drift": Drift,
     "noise": Noise,
     "stuck": Stuck,
+    "replacement": Replacement,
     "state": State,
     "drop_out": DropOut,
-    "replacement": Replacement,
 }
-"""By kind."""
+"""By kind, in the order in which they act."""
 
 AnyEffect = Annotated[
     Lag | CompressionLow | Bias | Drift | Noise | Stuck | State | DropOut | Replacement, Field(discriminator="kind")
