@@ -17,7 +17,7 @@ from firmware_sim.alarms import PRIORITY, STEPS_AT_LEAST, Code, Priority
 from firmware_sim.alarms import State as AlarmState
 from firmware_sim.firmware import SUPPORTED_MODES, VERSION, subscriptions
 from firmware_sim.ladder import State
-from firmware_sim.pump import RATE_EXPIRES_AFTER, SEQUENCES, Op, Pump
+from firmware_sim.pump import RATE_EXPIRES_AFTER, Op, Pump
 
 STEP_FRAMES = ["PUMP_BasalCmd", "CTRL_Status", "CTRL_Diag", "HB_CTRL", "SYNC_Done"]
 """What an uneventful step is answered with, in this order."""
@@ -54,6 +54,8 @@ def test_a_run_does_not_depend_on_how_often_the_roll_was_called() -> None:
         bench.run(40, 1700)
         runs.append(bench.log[start:])
     assert runs[0] == runs[1] == runs[2] == runs[3]
+    first = {frame.can_id: frame.data[1] & 0xF for frame in reversed(of_ctrl(runs[0])) if len(frame.data) == 8}
+    assert set(first.values()) == {0}  # every counter of the run starts at 0
 
 
 def test_a_roll_call_in_the_middle_of_a_run_starts_anew() -> None:
@@ -195,8 +197,8 @@ def test_no_counter_wraps_into_a_dose(start: int) -> None:
 
 def test_command_numbers_count_up_and_wrap() -> None:
     bench = Bench()
-    for k in range(SEQUENCES + 5):
-        assert bench.step().command["BasalCmdSeq"] == k % SEQUENCES
+    for k in range(1030):
+        assert bench.step().command["BasalCmdSeq"] == k % 1023  # 1023 is SNA
 
 
 def test_skipped_steps_age_the_sample_by_the_true_distance() -> None:
@@ -279,20 +281,19 @@ def test_an_open_loop_runs_the_schedule() -> None:
     assert set(rates) <= {bench.basal // 5, bench.basal // 5 + 1}
 
 
-@pytest.mark.parametrize("sequence", [7, 6, 0, 7 - 127, 255])
-def test_an_old_or_repeated_mode_command_is_ignored(sequence: int) -> None:
+@pytest.mark.parametrize(("last", "number"), [(7, 7), (7, 6), (7, 0), (7, 135), (7, 255), (200, 200), (200, 255)])
+def test_an_old_or_repeated_mode_command_is_ignored(last: int, number: int) -> None:
     bench = Bench()
     bench.run(3)
-    bench.send("MODE_Cmd", ModeRequest=S2, ModeCmdSeq=7, SuspendRequest=0)
+    bench.send("MODE_Cmd", ModeRequest=S2, ModeCmdSeq=last, SuspendRequest=0)
     assert bench.step().status["CtrlMode"] == S2
     errors = bench.step().diag["SequenceErrorCount"]
-    number = sequence if sequence >= 0 else sequence + 255
     for _ in range(3):
         bench.send("MODE_Cmd", ModeRequest=MODE_OFF, ModeCmdSeq=number, SuspendRequest=1)
         turn = bench.step()
         assert turn.status["CtrlMode"] == S2
         assert turn.state == State.AUTO
-    assert turn.diag["SequenceErrorCount"] - errors == (0 if number == 7 else 3)  # a repetition is no error
+    assert turn.diag["SequenceErrorCount"] - errors == (0 if number == last else 3)  # a repetition is no error
 
 
 @pytest.mark.parametrize("sequence", [8, 7 + 127])

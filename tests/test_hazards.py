@@ -119,6 +119,20 @@ def test_a_user_who_suspends_is_no_hazard() -> None:
     assert watched(bench.log) == none_but()
 
 
+def test_a_late_sample_behind_a_newer_one_does_not_age_it() -> None:
+    """The device has the newer one, and may dose on it for 15 min."""
+    bench = Bench(mode=S2)
+    bench.run(24, 2500)
+    late = {"CgmSampleSeq": bench.k % 65535, "CgmSampleStep": bench.k % 256}
+    bench.step(cgm=[])
+    bench.step(cgm=[bench.sample(2500), bench.sample(2500, **late)])
+    for _ in range(3):
+        turn = bench.step(cgm=[])
+        assert turn.state == State.AUTO
+        assert turn.rate > bench.basal // 5
+    assert watched(bench.log) == none_but()
+
+
 def test_fields_the_monitor_cannot_read_do_not_stop_it() -> None:
     for phase in range(16):
         assert watched(doctored("SYNC_Step", 50, SyncPhase=phase))["H2"] == 0

@@ -12,6 +12,7 @@ from pumpbench.calibration import Tuning
 from can_bus.frame import Frame
 from firmware_sim.alarms import Code
 from firmware_sim.alarms import State as AlarmState
+from firmware_sim.control import layout
 from firmware_sim.control.layout import LIMITER_STALE_CGM
 from firmware_sim.ladder import Ladder, State
 from firmware_sim.pump import Op
@@ -189,6 +190,19 @@ def test_samples_up_to_15_min_old_are_used(delay: int) -> None:
     assert turn.diag["LostFrameCount"] == turn.diag["SequenceErrorCount"] == 0
 
 
+@pytest.mark.parametrize("late", [0, 1, 2, 3])
+def test_age_counts_from_when_the_sample_was_taken(late: int) -> None:
+    bench = high()
+    fields = {"CgmSampleSeq": bench.k % 65535, "CgmSampleStep": bench.k % 256}
+    for _ in range(late):
+        bench.step(cgm=[])
+    turn = bench.step(cgm=[bench.sample(HIGH, **fields)])
+    assert turn.status["LastCgmSeq"] == fields["CgmSampleSeq"]
+    for age in range(late + 1, 12):
+        assert turn.state == at_age(age - 1)
+        turn = bench.step(drop=True)
+
+
 @pytest.mark.parametrize("delay", [4, 5, 15, 16, 100, 255])
 def test_older_samples_are_not_used(delay: int) -> None:
     bench = high()
@@ -327,6 +341,23 @@ def test_the_second_sample_after_a_gap_makes_no_trend_either() -> None:
     rates = rates_after(5, GLUCOSE, 1600, 1800, 1800, 1800)
     for rate in rates:
         assert rate == pytest.approx(without_trend(1800), abs=3)
+
+
+@pytest.mark.parametrize(("missing", "settles"), [(2, False), (3, False), (4, True), (5, True)])
+def test_trends_are_dropped_exactly_when_the_ladder_went_down(missing: int, settles: bool) -> None:
+    """The sensor took no samples, so no counter tells of them; 40 mg/dL later it is back."""
+    bench = Bench(mode=NMA)
+    bench.run(60)
+    states = [bench.step(cgm=[]).state for _ in range(missing)]
+    assert (DEGRADED in states) == settles
+    demands = []
+    for _ in range(2):
+        bench.step(1600)
+        demands.append(bench.firmware._outputs[layout.OUT_DEMAND] >> 16)  # what the law asks for, whatever it may
+    if settles:
+        assert demands == pytest.approx([without_trend(1600)] * 2, abs=3)
+    else:
+        assert demands[0] > without_trend(1600) + 200
 
 
 def test_a_short_gap_keeps_the_trend() -> None:
