@@ -243,11 +243,14 @@ class Transmitter:
     """Builds the frames of one or several nodes and keeps their E2E counters.
 
     Counters start at 0 and step by one per frame and message, so that the same calls give the same bytes.
+
+    Attributes:
+        counters: message name -> COUNTER of its next frame.
     """
 
     def __init__(self) -> None:
         self._codecs = messages()
-        self._counters = dict.fromkeys(self._codecs, 0)
+        self.counters = dict.fromkeys(self._codecs, 0)
 
     def frame(self, name: str, **values: int) -> Frame:
         """The next frame of message `name` with these raw values.
@@ -260,8 +263,8 @@ class Transmitter:
         except KeyError:
             codec = message(name)
         word = codec.pack(values)  # a refused value does not use up a count
-        counter = self._counters[name]
-        self._counters[name] = (counter + 1) % COUNTER_MODULUS
+        counter = self.counters[name]
+        self.counters[name] = (counter + 1) % COUNTER_MODULUS
         return Frame(codec.can_id, protect(codec, word, counter))
 
 

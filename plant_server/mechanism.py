@@ -96,8 +96,5 @@ def lose_held(words: Words) -> None:
 
 def ledger_closes(words: Words) -> bool:
     """Whether every stroke is accounted for."""
-    return bool(
-        words[COMMANDED] == words[DELIVERED] + words[PENDING] + words[LOST]
-        and 0 <= words[HELD] <= words[PENDING]
-        and words[LOST] >= 0
-    )
+    _, commanded, pending, delivered, lost, held, _, _ = words.tolist()
+    return bool(commanded == delivered + pending + lost and 0 <= held <= pending and lost >= 0)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from can_bus.batch import Layout
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 
@@ -70,6 +71,21 @@ AUX_INSULIN, AUX_PRAMLINTIDE, AUX_PUMP = 1, 2, 0
 """PUMP_Alarm.PumpAlarmAux: which drug it is about."""
 
 BATTERY_LOW_PERCENT = 20
+
+REPORT: Layout = (
+    (
+        "PUMP_Status",
+        (
+            "PumpState", "PumpLastBasalSeq", "InsulinReservoir", "PramReservoir", "PumpBattery", "InsulinOcclusion",
+            "PramOcclusion", "TbrActive",
+        ),
+        {},
+    ),
+    ("PUMP_Delivered", ("InsulinTotal", "PramTotal"), {"PumpBootCount": 0}),
+    ("PUMP_BolusState", (), {"BolusStateHormone": 1, "BolusPhase": 0, "BolusDeliveredRaw": 0}),
+    ("PUMP_BolusState", (), {"BolusStateHormone": 2, "BolusPhase": 0, "BolusDeliveredRaw": 0}),
+)  # fmt: skip
+"""What the pump says in every step; `Pump.values` are the raw values."""
 
 
 class AckResult(enum.IntEnum):
@@ -251,9 +267,16 @@ class Pump:
 
     def report(self, transmitter: Transmitter) -> list[Frame]:
         """Alarms, status, totals and bolus states as they stand."""
+        values = iter(self.values())
+        frames = self.report_alarms(transmitter)
+        for name, signals, constants in REPORT:
+            frames.append(transmitter.frame(name, **constants, **{signal: next(values) for signal in signals}))
+        return frames
+
+    def values(self) -> tuple[int, ...]:
+        """The raw values of `REPORT` as they stand."""
         insulin, pramlintide = self.insulin, self.pramlintide
         ratio = self.settings.coformulation_ug_per_u
-        frame = transmitter.frame
         if ratio is None:
             pram_left, pram_total = pramlintide.remaining, pramlintide.delivered * pramlintide.settings.stroke_volume
             pram_occlusion = pramlintide.occlusion
@@ -261,31 +284,18 @@ class Pump:
             pram_left = insulin.remaining * ratio
             pram_total = insulin.delivered * insulin.settings.stroke_volume * ratio
             pram_occlusion = insulin.occlusion
-        sequence = {} if self._sequence is None else {"PumpLastBasalSeq": self._sequence}
-        return [
-            *self._report_alarms(transmitter),
-            frame(
-                "PUMP_Status",
-                PumpState=self._state(),
-                InsulinReservoir=min(round(insulin.remaining * 10), 4000),
-                PramReservoir=min(round(pram_left), 4093),
-                PumpBattery=round(self.battery),
-                InsulinOcclusion=insulin.occlusion,
-                PramOcclusion=pram_occlusion,
-                TbrActive=int(self._commanded),
-                **sequence,
-            ),
-            frame(
-                "PUMP_Delivered",
-                PumpBootCount=0,
-                InsulinTotal=round(insulin.delivered * insulin.settings.stroke_volume * 1000),
-                PramTotal=round(pram_total * 100),
-            ),
-            *(
-                frame("PUMP_BolusState", BolusStateHormone=hormone, BolusPhase=0, BolusDeliveredRaw=0)
-                for hormone in (1, 2)
-            ),
-        ]
+        return (
+            self._state(),
+            SEQUENCES if self._sequence is None else self._sequence,
+            min(round(insulin.remaining * 10), 4000),
+            min(round(pram_left), 4093),
+            round(self.battery),
+            insulin.occlusion,
+            pram_occlusion,
+            int(self._commanded),
+            round(insulin.delivered * insulin.settings.stroke_volume * 1000),
+            round(pram_total * 100),
+        )
 
     def _state(self) -> PumpState:
         if not self.powered or self.insulin.stopped:
@@ -314,7 +324,7 @@ class Pump:
             causes.add((Alarm.BATTERY_LOW, AUX_PUMP))
         return causes
 
-    def _report_alarms(self, transmitter: Transmitter) -> list[Frame]:
+    def report_alarms(self, transmitter: Transmitter) -> list[Frame]:
         """One frame per change of state, repeated until confirmed."""
         causes = self._causes()
         for cause in sorted(causes - self._alarms.keys()):

@@ -12,13 +12,14 @@ import numpy as np
 
 import dbc
 from can_bus import codec
+from can_bus.batch import Batch, Layout
 from can_bus.codec import Check, Receiver, Transmitter
 from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
 
 from . import mechanism, physiology
 from .physiology import Patient, Variability
-from .pump import Pump, PumpSettings
+from .pump import REPORT, Pump, PumpSettings
 from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
 from .sensor import Sensor, SensorSettings
 
@@ -32,6 +33,27 @@ ALARM_PENDING = 1
 
 NMT_BOOT_UP, NMT_OPERATIONAL = 0, 5
 """HB_PUMP.NmtPump and HB_CGM.NmtCgm, as CANopen numbers them."""
+
+
+READING: Layout = (("CGM_Reading", ("CgmState", "GlucoseConc", "GlucoseRate", "CgmSampleSeq", "CgmSampleStep"), {}),)
+HEARTBEATS: Layout = (
+    ("HB_PUMP", ("TogglePump",), {"NmtPump": NMT_OPERATIONAL, "ResetCausePump": 0, "BootPump": 0}),
+    ("HB_CGM", ("ToggleCgm",), {"NmtCgm": NMT_OPERATIONAL, "ResetCauseCgm": 0, "BootCgm": 0}),
+)
+TRUTH: Layout = tuple(
+    ("PLANT_Truth", ("TruthStep", *signals), {"TruthSel": page})
+    for page, signals in enumerate(
+        (
+            ("TruthGlucose", "TruthInterstitial"),
+            ("TruthInsulin", "TruthPramlintide"),
+            ("TruthEta", "TruthQsto"),
+            ("TruthRa", "TruthMealCarbs"),
+            ("TruthInsulinCommanded", "TruthInsulinPending", "TruthInsulinLost"),
+            ("TruthPramCommanded", "TruthPramPending", "TruthPramLost"),
+        )
+    )
+)
+TOKEN: Layout = (("SYNC_Step", ("SyncPhase", "StepIndex", "SimTime"), {}),)
 
 
 class PlantError(RuntimeError):
@@ -63,6 +85,9 @@ class PlantServer:
         self._call = 0
         self._roll = Transmitter()
         self._transmitter = Transmitter()
+        rest = (*REPORT, *HEARTBEATS, *TRUTH, *TOKEN)
+        self._with_reading = Batch(self._transmitter, (*READING, *rest))
+        self._without_reading = Batch(self._transmitter, rest)
         self._receiver = Receiver(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
         self._patient = _Body(run)
         self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name)
@@ -189,17 +214,26 @@ class PlantServer:
         self._turns = 0
         if not last:
             self._patient.feel(self.step)
-        frame = self._transmitter.frame
         frames = self._outbox
         self._outbox = []
-        frames += self._read_sensor()
         frames += self._confirm_pump_alarms()
-        frames += self._pump.report(self._transmitter)
+        frames += self._pump.report_alarms(self._transmitter)
+        frames += self._sensor_status()
+        reading = self._read_sensor()
+        regular = self._with_reading if reading else self._without_reading
         toggle = self.step & 1
-        frames.append(frame("HB_PUMP", NmtPump=NMT_OPERATIONAL, TogglePump=toggle, ResetCausePump=0, BootPump=0))
-        frames.append(frame("HB_CGM", NmtCgm=NMT_OPERATIONAL, ToggleCgm=toggle, ResetCauseCgm=0, BootCgm=0))
-        frames += self._tell_truth()
-        frames.append(frame("SYNC_Step", SyncPhase=self._phase, StepIndex=self.step, SimTime=self.step * STEP_SECONDS))
+        frames += regular.frames(
+            [
+                *reading,
+                *self._pump.values(),
+                toggle,
+                toggle,
+                *self._truth(),
+                self._phase,
+                self.step,
+                self.step * STEP_SECONDS,
+            ]
+        )
         return frames
 
     # ---- between two instants
@@ -212,35 +246,34 @@ class PlantServer:
         self._patient.advance(self.step, insulin, pramlintide)
         self.step += 1
 
-    def _read_sensor(self) -> list[Frame]:
-        frames = []
+    def _read_sensor(self) -> tuple[int, ...]:
+        """The raw values of READING; none when the sensor has dropped this sample."""
         sample = self._sensor.sample(self.step, self._patient.interstitial)
-        if sample is not None:
-            rate = RATE_UNKNOWN if sample.rate is None else min(max(round(sample.rate * 100), -1020), 1020)
-            frames.append(
-                self._transmitter.frame(
-                    "CGM_Reading",
-                    CgmState=sample.state,
-                    GlucoseConc=GLUCOSE_UNKNOWN if sample.glucose is None else round(sample.glucose * 10),
-                    GlucoseRate=rate,
-                    CgmSampleSeq=sample.number,
-                    CgmSampleStep=self.step % 256,
-                )
-            )
+        if sample is None:
+            return ()
+        return (
+            sample.state,
+            GLUCOSE_UNKNOWN if sample.glucose is None else round(sample.glucose * 10),
+            RATE_UNKNOWN if sample.rate is None else min(max(round(sample.rate * 100), -1020), 1020),
+            sample.number,
+            self.step % 256,
+        )
+
+    def _sensor_status(self) -> list[Frame]:
         status = self._sensor.status(self.step)
-        if status is not None:
-            frames.append(
-                self._transmitter.frame(
-                    "CGM_Status",
-                    CgmFaultBits=status.fault_bits,
-                    CgmSessionId=status.session,
-                    CgmSensorAge=min(status.age_minutes, 65533),
-                    CgmNoise=min(round(status.noise * 2), 252),
-                    CgmBattery=round(status.battery * 2),
-                    CgmDropCount=status.dropped % 255,
-                )
+        if status is None:
+            return []
+        return [
+            self._transmitter.frame(
+                "CGM_Status",
+                CgmFaultBits=status.fault_bits,
+                CgmSessionId=status.session,
+                CgmSensorAge=min(status.age_minutes, 65533),
+                CgmNoise=min(round(status.noise * 2), 252),
+                CgmBattery=round(status.battery * 2),
+                CgmDropCount=status.dropped % 255,
             )
-        return frames
+        ]
 
     def _confirm(self, alarm: dict[str, int]) -> None:
         """The user reads every alarm and confirms it."""
@@ -261,29 +294,17 @@ class PlantServer:
             )
         return frames
 
-    def _tell_truth(self) -> list[Frame]:
-        body, pump = self._patient, self._pump
-        pages: list[dict[str, int]] = [
-            {
-                "TruthGlucose": _raw(body.glucose, 0.02),
-                "TruthInterstitial": _raw(body.interstitial, 0.02),
-            },
-            {
-                "TruthInsulin": _raw(body.plasma_insulin / PMOL_PER_L_PER_MU_PER_L, 0.02),
-                "TruthPramlintide": _raw(body.plasma_pramlintide, 0.02),
-            },
-            {"TruthEta": _raw(body.eta, 0.0001), "TruthQsto": _raw(body.q_sto, 4.0)},
-            {
-                "TruthRa": _raw(body.rate_of_appearance, 0.001),
-                "TruthMealCarbs": _raw(body.carbs_starting(self.step), 0.02),
-            },
-            _ledger("Insulin", pump.insulin.words),
-            _ledger("Pram", pump.pramlintide.words),
-        ]
+    def _truth(self) -> list[int]:
+        """The raw values of TRUTH."""
+        body, number = self._patient, self.step % 65536
         return [
-            self._transmitter.frame("PLANT_Truth", TruthSel=page, TruthStep=self.step % 65536, **values)
-            for page, values in enumerate(pages)
-        ]
+            number, _raw(body.glucose, 0.02), _raw(body.interstitial, 0.02),
+            number, _raw(body.plasma_insulin / PMOL_PER_L_PER_MU_PER_L, 0.02), _raw(body.plasma_pramlintide, 0.02),
+            number, _raw(body.eta, 0.0001), _raw(body.q_sto, 4.0),
+            number, _raw(body.rate_of_appearance, 0.001), _raw(body.carbs_starting(self.step), 0.02),
+            number, *_ledger(self._pump.insulin.words),
+            number, *_ledger(self._pump.pramlintide.words),
+        ]  # fmt: skip
 
 
 def _raw(value: float, scale: float) -> int:
@@ -291,12 +312,11 @@ def _raw(value: float, scale: float) -> int:
     return min(max(round(value / scale), 0), 65535)
 
 
-def _ledger(drug: str, motor: mechanism.Words) -> dict[str, int]:
-    return {
-        f"Truth{drug}Commanded": int(motor[mechanism.COMMANDED]) % 65536,
-        f"Truth{drug}Pending": min(int(motor[mechanism.PENDING]), 16383),
-        f"Truth{drug}Lost": int(motor[mechanism.LOST]) % 16384,
-    }
+def _ledger(motor: mechanism.Words) -> tuple[int, int, int]:
+    """Commanded, pending and lost strokes as the truth pages have them."""
+    words = motor.tolist()
+    commanded, pending, lost = (words[i] for i in (mechanism.COMMANDED, mechanism.PENDING, mechanism.LOST))
+    return commanded % 65536, min(pending, 16383), lost % 16384
 
 
 def _mode_name(code: int) -> str:

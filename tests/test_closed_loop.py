@@ -143,7 +143,9 @@ def test_cohort_is_where_the_prototype_was(
     for folder in folders:
         assert 25 < folder.metrics["insulin_u_per_day"] < 70
         safety = folder.metrics["safety"]
-        assert safety["limiter_steps"] == 0
+        bits = folder.trace.get("LimiterBits")[:-1].astype(int)
+        assert not (bits & ~8).any()  # no limit is touched; a sensor below its range suspends (bit 3)
+        assert safety["limiter_steps"] == (bits != 0).sum()
         assert all(drug["closes"] for drug in safety["ledger"].values())
         if strategy == "s2":
             ratio = folder.metrics["pramlintide_ug_per_day"] / folder.metrics["insulin_u_per_day"]

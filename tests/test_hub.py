@@ -332,7 +332,7 @@ def test_the_documented_c_client_works(hub: Hub, tmp_path: Path) -> None:
         "#include <stdint.h>\n#include <string.h>\n#include <sys/socket.h>\n#include <sys/un.h>\n#include <unistd.h>\n"
         "#include <linux/can.h>\n#include <stdio.h>\n"
         + re.search(r"struct hello \{.*?\};", text)[0]  # type: ignore[index]
-        + "\nstatic void handle(struct can_frame *f) { printf(\"%x %d %x\\n\", f->can_id, f->len, f->data[0]); }\n"
+        + '\nstatic void handle(struct can_frame *f) { printf("%x %d %x\\n", f->can_id, f->len, f->data[0]); }\n'
         + "int main(void) {\n"
         + example.replace("/tmp/bus", f"{tmp_path}/bus").replace("handle(&f)", "handle(&f)")
         + "return 0; }\n"

@@ -293,6 +293,25 @@ class Child:
 
 
 @contextlib.contextmanager
+def _one_cpu() -> Iterator[frozenset[int]]:
+    """Keep this process, and what it starts, on one CPU; yields the others, for those who need not wait their turn.
+
+    In lockstep only one side runs at a time. Handing the turn over within a CPU takes a fifth of the time that waking
+    another CPU does (measured in a virtual machine: 10 against 55 to 75 us there and back).
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield frozenset()
+        return
+    cpus = os.sched_getaffinity(0)
+    mine = sorted(cpus)[os.getpid() % len(cpus)]
+    os.sched_setaffinity(0, {mine})
+    try:
+        yield frozenset(cpus - {mine})
+    finally:
+        os.sched_setaffinity(0, cpus)
+
+
+@contextlib.contextmanager
 def _children() -> Iterator[list[Child]]:
     children: list[Child] = []
     try:
@@ -315,6 +334,7 @@ def _processes(prepared: Prepared) -> Path:
     request = prepared.request
     with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory, contextlib.ExitStack() as stack:
         place = Path(directory)
+        other_cpus = stack.enter_context(_one_cpu())
         children = stack.enter_context(_children())
         hub: Hub | None = None
         if request.bus == "hub":
@@ -334,6 +354,8 @@ def _processes(prepared: Prepared) -> Path:
             environment = os.environ | {"PUMPBENCH_BUS": device_url, "PYTHONUNBUFFERED": "1"}
             child = Child(name, command, environment, log, ready)
             children.append(child)
+            if name == "recorder" and other_cpus:
+                os.sched_setaffinity(child.process.pid, other_cpus)
             if ready:
                 child.wait_ready(READY_SECONDS, poll)
             return child
