@@ -61,7 +61,7 @@ class Fast:
         bench = limited_bench(mode)
         self.bench = bench
         self.firmware: Firmware = bench.firmware  # type: ignore[assignment]
-        self.counter = bench.transmitter._counters["CGM_Reading"]
+        self.counter = bench.transmitter.counters["CGM_Reading"]
         self.command, self.status = codec.message("PUMP_BasalCmd"), codec.message("CTRL_Status")
 
     def step(self, word: int) -> tuple[dict[str, int], dict[str, int]]:
@@ -246,13 +246,13 @@ def test_one_wrong_bit_is_one_error_and_nothing_else(name: str) -> None:
     bench, undisturbed = Bench(mode=S2), Bench(mode=S2)
     bench.run(5, 1800), undisturbed.run(5, 1800)
     bits = codec.message(name).length * 8
-    counter = bench.transmitter._counters[name]
+    counter = bench.transmitter.counters[name]
     for bit in range(bits):
-        bench.transmitter._counters[name] = counter  # the good frame that comes later has this number
+        bench.transmitter.counters[name] = counter  # the good frame that comes later has this number
         frame = good_frame(bench, name)
-        bench.transmitter._counters[name] = counter
+        bench.transmitter.counters[name] = counter
         turn = bench.step(1800, also=[frame._replace(data=flipped(frame.data, bit))])
-        counter = bench.transmitter._counters[name]
+        counter = bench.transmitter.counters[name]
         other = undisturbed.step(1800)
         assert turn.command == other.command
         assert turn.status == other.status
@@ -267,9 +267,9 @@ def test_two_or_three_wrong_bits_are_noticed_as_well() -> None:
     draw = random.Random(2)
     for count in range(1000):
         message = codec.message(draw.choice(["CGM_Reading", "PUMP_Delivered", "MODE_Cmd"]))
-        counter = bench.transmitter._counters[message.name]
+        counter = bench.transmitter.counters[message.name]
         frame = good_frame(bench, message.name)
-        bench.transmitter._counters[message.name] = counter
+        bench.transmitter.counters[message.name] = counter
         wrong = flipped(frame.data, *draw.sample(range(message.length * 8), draw.choice((2, 3))))
         bench.give(frame._replace(data=wrong))
         if count % 100 == 99:
@@ -295,9 +295,9 @@ def test_a_wrong_length_is_not_read(name: str) -> None:
     bench, undisturbed = Bench(mode=S2), Bench(mode=S2)
     bench.run(5, 1800), undisturbed.run(5, 1800)
     lengths = [length for length in range(9) if length != codec.message(name).length]
-    counter = bench.transmitter._counters[name]
+    counter = bench.transmitter.counters[name]
     frame = good_frame(bench, name)
-    bench.transmitter._counters[name] = counter
+    bench.transmitter.counters[name] = counter
     data = frame.data + bytes(8 - len(frame.data))
     turn = bench.step(1800, also=[frame._replace(data=data[:length]) for length in lengths])
     assert turn.command == undisturbed.step(1800).command
@@ -307,9 +307,9 @@ def test_a_wrong_length_is_not_read(name: str) -> None:
 def test_remote_and_29_bit_frames_with_a_known_id_are_counted_and_error_frames_are_not() -> None:
     bench, undisturbed = Bench(), Bench()
     bench.run(5), undisturbed.run(5)
-    counter = bench.transmitter._counters["CGM_Reading"]
+    counter = bench.transmitter.counters["CGM_Reading"]
     sample = bench.sample(3900)
-    bench.transmitter._counters["CGM_Reading"] = counter
+    bench.transmitter.counters["CGM_Reading"] = counter
     dressed = [
         Frame(CGM.can_id | CAN_RTR_FLAG, bytes(8)),
         Frame(CGM.can_id | CAN_EFF_FLAG, sample.data),
@@ -372,7 +372,7 @@ def test_any_code_in_any_field_is_survived(name: str) -> None:
     """CRC and counter are right; only plausibility can catch it."""
     message = codec.message(name)
     bench = limited_bench(S2)
-    counter = bench.transmitter._counters[name]
+    counter = bench.transmitter.counters[name]
     for field in message.fields.values():
         page = next((key for key, fields in message.pages.items() if field in fields), None)
         for raw in edges(field):
@@ -383,7 +383,7 @@ def test_any_code_in_any_field_is_survived(name: str) -> None:
             data = codec.protect(message, word, counter)
             if message.data_ids:
                 counter = (counter + 1) % 16
-                bench.transmitter._counters[name] = counter
+                bench.transmitter.counters[name] = counter
             bench.give(Frame(message.can_id, data))
             check_limits(bench.step(1000 + raw % 3000), bench)
 
@@ -435,7 +435,7 @@ def test_a_hundred_thousand_well_protected_random_frames_dose_nothing_above_the_
     draw = random.Random(101)
     names = [name for name in subscriptions() if name != "SYNC_Step"]
     states = set()
-    counters = dict(bench.transmitter._counters)
+    counters = dict(bench.transmitter.counters)
     for k in range(100_000):
         name = draw.choice(names)
         message = codec.message(name)
@@ -449,9 +449,9 @@ def test_a_hundred_thousand_well_protected_random_frames_dose_nothing_above_the_
             counters[name] = (counters[name] + 1) % 16
         bench.give(Frame(message.can_id, data))
         if k % 100 == 0:
-            bench.transmitter._counters.update(counters)
+            bench.transmitter.counters.update(counters)
             turn = bench.step(draw.randint(0, 8000))
-            counters = dict(bench.transmitter._counters)
+            counters = dict(bench.transmitter.counters)
             check_limits(turn, bench)
             states.add(turn.state)
     assert len(states) >= 2

@@ -285,7 +285,8 @@ def test_an_open_loop_runs_the_schedule() -> None:
 def test_an_old_or_repeated_mode_command_is_ignored(last: int, number: int) -> None:
     bench = Bench()
     bench.run(3)
-    bench.send("MODE_Cmd", ModeRequest=S2, ModeCmdSeq=last, SuspendRequest=0)
+    for sequence in (last // 2, last):
+        bench.send("MODE_Cmd", ModeRequest=S2, ModeCmdSeq=sequence, SuspendRequest=0)
     assert bench.step().status["CtrlMode"] == S2
     errors = bench.step().diag["SequenceErrorCount"]
     for _ in range(3):

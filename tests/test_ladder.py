@@ -261,9 +261,9 @@ def test_a_repeated_sample_in_a_fresh_frame_counts_once() -> None:
 
 def test_a_frozen_counter_is_a_lost_sensor() -> None:
     bench = high()
-    frozen = bench.transmitter._counters["CGM_Reading"]
+    frozen = bench.transmitter.counters["CGM_Reading"]
     for age in range(10):
-        bench.transmitter._counters["CGM_Reading"] = frozen
+        bench.transmitter.counters["CGM_Reading"] = frozen
         turn = bench.step(HIGH)
         assert turn.state == at_age(age)
         assert turn.diag["SequenceErrorCount"] == age
