@@ -521,8 +521,9 @@ class Hub:
         while any(client.out for client in readers) and (left := end - time.monotonic()) > 0:
             self.poll(left)
         for client in readers:
-            if client.out:
-                _log.error("%s did not take %d frames before the end", client.name, len(client.out) // RECORD_SIZE - 1)
+            untaken = len(client.out) // RECORD_SIZE - 1  # the goodbye is no frame
+            if untaken > 0:
+                _log.error("%s did not take %d frames before the end", client.name, untaken)
         for client in list(self._clients.values()):
             self._part(client)
         self.closed = True

@@ -218,8 +218,8 @@ class PlantServer:
         self._outbox = []
         frames += self._confirm_pump_alarms()
         frames += self._pump.report_alarms(self._transmitter)
-        frames += self._sensor_status()
         reading = self._read_sensor()
+        frames += self._sensor_status()
         regular = self._with_reading if reading else self._without_reading
         toggle = self.step & 1
         frames += regular.frames(

@@ -46,7 +46,7 @@ def test_every_sensor_runs_and_tells_its_status_hourly(name: str, tmp_path: Path
     assert (np.nanmax(np.abs(error)) > 1) == (name != "ideal")
     ids = [frame.can_id for frame in frames]
     status = codec.message("CGM_Status").can_id
-    assert all(ids[k - 1] == codec.message("CGM_Reading").can_id for k, can_id in enumerate(ids) if can_id == status)
+    assert all(ids[k + 1] == codec.message("CGM_Reading").can_id for k, can_id in enumerate(ids) if can_id == status)
     assert name in cli.SENSORS
 
 

@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import importlib.metadata
 import json
+import logging
 import os
 import platform
 import re
@@ -338,6 +339,8 @@ def _processes(prepared: Prepared) -> Path:
         children = stack.enter_context(_children())
         hub: Hub | None = None
         if request.bus == "hub":
+            # when a run breaks off, the reason is said once, by us; who then left frames unread does not matter
+            logging.getLogger("can_bus.hub").addHandler(logging.NullHandler())
             plant_url = f"unix:{place / 'plant.sock'}"
             hub = stack.enter_context(Hub(plant_url))
             link: Link = stack.enter_context(hub.local_link())
