@@ -2,7 +2,8 @@
 
 The ceiling of a bus is the bare exchange of the same number of frames per step in both directions between the same
 number of processes: prebuilt bytes on raw sockets, nothing packed, checked, integrated or decided. The ceiling of the
-loop in one process is the plant alone.
+loop in one process is the plant alone. Beside simglucose (`plant/vs-simglucose`) the "ceiling" is the peer: see
+`simglucose_peer`.
 """
 
 import json
@@ -19,6 +20,7 @@ from can_bus import codec
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from pumpbench import rig
+from pumpbench.benchmark import simglucose_peer
 from pumpbench.benchmark.round_trips import CEILING_OF, Figure, measure, round_trips, vcan_available
 from pumpbench.trace import decode
 
@@ -110,8 +112,14 @@ def _frames_per_step(folder: Path) -> tuple[int, int]:
     return round(float(np.sum(~from_device)) / steps), round(float(np.sum(from_device)) / steps)
 
 
-def all_figures(*, quick: bool, only_vcan: bool = False) -> list[Figure]:
-    """Every figure this machine can give; on a kernel without CAN those of vcan come from `tools/with_vcan`."""
+def all_figures(*, quick: bool, only_vcan: bool = False, peers: bool = True) -> list[Figure]:
+    """Every figure this machine can give; on a kernel without CAN those of vcan come from `tools/with_vcan`.
+
+    Args:
+        quick: one short run of each.
+        only_vcan: nothing but the figures of this kernel's vcan0.
+        peers: other simulators too, which pip installs at the first time.
+    """
     runs, days = (1, 1) if quick else (5, 5)
     steps = 500 if quick else 5000
     if only_vcan:
@@ -120,6 +128,8 @@ def all_figures(*, quick: bool, only_vcan: bool = False) -> list[Figure]:
             closed_loop("vcan", days=1, runs=min(runs, 3)),
         ]
     figures = plant_alone(days=10 if quick else 100, runs=runs)
+    if peers:
+        figures += simglucose_peer.compare(runs=1 if quick else 3, days=10 if quick else 100)
     figures += round_trips(["hub"], steps=steps, runs=runs)
     figures += [closed_loop("inproc", days=days, runs=runs), closed_loop("hub", days=days, runs=runs)]
     if vcan_available():
