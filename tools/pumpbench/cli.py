@@ -27,6 +27,9 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 SCENARIOS = "validation-14d, tuning, camerlingo, fasting, or a YAML or CSV file."
 SENSORS = "coloured, ideal, breton, facchinetti, dexcom-g5, dexcom-g6, vettoretti, or a YAML file."
+PHYSIOLOGIES = "Equations: S2008, or S2013 with counter-regulation (default: what the patient's file says)."
+PRAMLINTIDE = "Parameter set: P2, P4, moderate, conservative or strong; +type1 behind it for a lower bioavailability."
+VARIABILITY = "What varies in the patient: all, none, or a comma list of k_abs, f, insulin_pk, circadian."
 
 
 class Strategy(StrEnum):
@@ -79,6 +82,9 @@ def run(
         str | None, typer.Option(help='Command that starts another firmware; "{bus}" becomes the bus URL.')
     ] = None,
     sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
+    physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,
+    pramlintide: Annotated[str, typer.Option(help=PRAMLINTIDE)] = "P2",
+    variability: Annotated[str, typer.Option(help=VARIABILITY)] = "all",
     out: Annotated[Path | None, typer.Option(help="Run folder to write (default: below runs/).")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing run folder at --out.")] = False,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware's first answer.")] = 20.0,
@@ -88,6 +94,7 @@ def run(
     from pumpbench import rig  # noqa: PLC0415
 
     names = _patients(patient)
+    varying = rig.variability_sources(variability)
     requests = [
         rig.Request(
             patient=name,
@@ -101,6 +108,9 @@ def run(
             faults=faults,
             firmware=firmware,
             sensor=sensor,
+            physiology=physiology,
+            pramlintide=pramlintide,
+            variability=varying,
             overwrite=overwrite or out is None,
             connect_timeout=connect_timeout,
             step_timeout=step_timeout,
@@ -249,6 +259,9 @@ def benchmark(
         str | None, typer.Option("--json", help="Write the figures to this file; - is stdout.")
     ] = None,
     quick: Annotated[bool, typer.Option(help="One short run of each: to see that it works, not to quote.")] = False,
+    peers: Annotated[
+        bool, typer.Option(help="Beside simglucose too, which pip installs into a cache at the first time.")
+    ] = True,
     only_vcan: Annotated[bool, typer.Option(help="Only the figures of a kernel's vcan0.", hidden=True)] = False,
 ) -> None:
     """Measure speed: each figure beside its ceiling, in one run."""
@@ -257,7 +270,7 @@ def benchmark(
     from pumpbench.benchmark.closed_loop import all_figures, as_json  # noqa: PLC0415
 
     with errors.status("measuring"):
-        figures = all_figures(quick=quick, only_vcan=only_vcan)
+        figures = all_figures(quick=quick, only_vcan=only_vcan, peers=peers)
     if json_file == "-":
         print(as_json(figures))
         return
@@ -267,11 +280,16 @@ def benchmark(
     for name in ("figure", "value", "unit", "ceiling", "ratio", "runs"):
         table.add_column(name, justify="left" if name in ("figure", "unit") else "right")
     for figure in figures:
-        value, ceiling = f"{figure['value']:,.1f}", f"{figure['ceiling']:,.1f}"
-        table.add_row(figure["name"], value, figure["unit"], ceiling, f"{figure['ratio']:.2f}", str(figure["runs"]))
+        value, ceiling, ratio = (_readable(number) for number in (figure["value"], figure["ceiling"], figure["ratio"]))
+        table.add_row(figure["name"], value, figure["unit"], ceiling, ratio, str(figure["runs"]))
     console.print(table)
     if not any("vcan" in figure["name"] for figure in figures):
         errors.print("no vcan on this machine and tools/with_vcan could not provide one: its figures are missing")
+
+
+def _readable(number: float) -> str:
+    """Three digits at least, and no more behind the point than that takes."""
+    return f"{number:,.1f}" if abs(number) >= 10.0 else f"{number:.3g}"
 
 
 class Interrupted(Exception):

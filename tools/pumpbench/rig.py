@@ -35,7 +35,7 @@ from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.lockstep import Node
 from can_bus.url import open_link
-from plant_server.physiology import load_patient
+from plant_server.physiology import SOURCES, load_patient
 from plant_server.scenario import load_scenario
 from plant_server.sensor import load_sensor
 from plant_server.serve import serve
@@ -77,6 +77,9 @@ class Request:
     faults: Path | None = None
     firmware: str | None = None
     sensor: str = "coloured"
+    physiology: str | None = None  # None: what the patient's file says
+    pramlintide: str = "P2"
+    variability: tuple[str, ...] = tuple(SOURCES)
     overwrite: bool = False
     connect_timeout: float = 20.0
     step_timeout: float = 10.0
@@ -93,6 +96,22 @@ class Prepared:
     info: dict[str, Any]
 
 
+def variability_sources(text: str) -> tuple[str, ...]:
+    """Read what varies in the patient: `all`, `none`, or a comma list of `physiology.SOURCES`, in any order.
+
+    Raises:
+        RigError: there is no such source.
+    """
+    if text == "none":
+        return ()
+    names = {name.strip() for name in text.split(",")}
+    unknown = sorted(names - SOURCES.keys() - {"all"})
+    if unknown or ("all" in names and len(names) > 1):
+        what = f"there is no {unknown[0]!r}" if unknown else "all stands alone"
+        raise RigError(f"--variability {text!r}: {what}; choose all, none, or a comma list of {', '.join(SOURCES)}")
+    return tuple(source for source in SOURCES if source in names or "all" in names)
+
+
 def prepare(request: Request) -> Prepared:
     """Look up patient, scenario, strategy, faults and calibration.
 
@@ -107,7 +126,8 @@ def prepare(request: Request) -> Prepared:
         raise RigError("a seed is 0 or greater")
     if request.bus == "inproc" and request.firmware:
         raise RigError("--bus inproc runs the built-in firmware only; a --firmware command needs a bus, e.g. --bus hub")
-    patient = load_patient(request.patient)
+    variability = variability_sources(",".join(request.variability) or "none")
+    patient = load_patient(request.patient, physiology=request.physiology, pramlintide=request.pramlintide)
     scenario = load_scenario(
         request.scenario, seed=request.seed, patient=patient.name, days=request.steps / STEPS_PER_DAY
     )
@@ -118,7 +138,8 @@ def prepare(request: Request) -> Prepared:
     faults = load_faults(request.faults) if request.faults else ()
     calibration = calibrate(patient)
     sensor = load_sensor(request.sensor)
-    run = Run(patient, scenario, request.steps, request.seed, MODES[request.strategy], calibration, sensor=sensor)
+    mode = MODES[request.strategy]
+    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability)
     PlantServer(run)  # checks the rest
     info = {
         "pumpbench": __version__,
@@ -127,6 +148,9 @@ def prepare(request: Request) -> Prepared:
         "python": platform.python_version(),
         "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
         "patient": request.patient,
+        "physiology": patient.physiology,
+        "pramlintide": request.pramlintide,
+        "variability": list(variability),
         "strategy": request.strategy,
         "scenario": scenario.name,
         "days": request.steps / STEPS_PER_DAY,
