@@ -255,7 +255,8 @@ class Firmware:
         if self._receiver.crc_errors + self._receiver.malformed > self._crc_errors_seen:
             self._crc_errors_seen = self._receiver.crc_errors + self._receiver.malformed
             self._last_e2e_error = step
-        if self._outputs[layout.OUT_LIMITERS] and state == State.AUTO:
+        # a missing sample is told by LimiterBits, and by CgmLost when it matters
+        if self._outputs[layout.OUT_LIMITERS] & ~layout.LIMITER_STALE_CGM and state == State.AUTO:
             self._last_limited = step
         if self._rejected:
             self._last_rejected = step

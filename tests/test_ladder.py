@@ -524,3 +524,17 @@ def test_no_dose_above_the_schedule_without_a_fresh_sample(mode: int) -> None:
             assert command["InsulinRate"] * 5 <= bench.basal
         if age >= 7:
             assert command["BasalOp"] == Op.RESUME_SCHEDULE
+
+
+def test_missing_samples_never_raise_insulin() -> None:
+    """After a fall the held glucose looks like its end; the law alone would go from 0 to twice the schedule."""
+    bench = Bench()
+    for k in range(40):
+        turn = bench.step(1500 - 20 * k)
+    rates = [turn.command["InsulinRate"]]
+    for _ in range(3):
+        turn = bench.step(drop=True)
+        assert turn.state == State.AUTO
+        rates.append(turn.command["InsulinRate"])
+    assert rates == sorted(rates, reverse=True)
+    assert turn.status["LimiterBits"] & 16

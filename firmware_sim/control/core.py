@@ -9,6 +9,7 @@ supervisor, and arrives here as IN_LIMIT.
 from .fixed import Ints, round_divide, round_shift, saturate
 from .layout import (
     BASAL,
+    IN_GLUCOSE,
     IN_LIMIT,
     IN_MODE,
     IOB_1,
@@ -24,6 +25,7 @@ from .layout import (
     OUT_LIMITERS,
     OUT_PRAM_RATE,
     OUT_RATE,
+    RATE,
     RATE_CARRY,
     SATURATIONS,
 )  # fmt: skip
@@ -78,10 +80,16 @@ def limit_rate(demand: int, state: Ints, parameters: Ints, inputs: Ints, outputs
         ceiling = 0
         if demand > 0:
             bits |= LIMITER_LOW_GLUCOSE
+    if inputs[IN_GLUCOSE] < 0:
+        # without a new sample the held one looks like the end of a fall: insulin may go down but never up
+        ceiling = min(ceiling, state[RATE] << 16)
+        if demand > ceiling:
+            bits |= LIMITER_STALE_CGM
     outputs[OUT_LIMITERS] = bits
     total = min(max(demand, 0), ceiling) + state[RATE_CARRY]
     state[RATE_CARRY] = total & 65535
-    return min(total >> 16, ceiling >> 16)
+    state[RATE] = min(total >> 16, ceiling >> 16)
+    return state[RATE]
 
 
 def control_step(state: Ints, parameters: Ints, inputs: Ints, outputs: Ints) -> None:

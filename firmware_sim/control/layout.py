@@ -39,6 +39,7 @@ STATE = (
     Word("PRAM_CARRY", "0.1 ug/h / 2000", 0, 0, 1999, "part of the pramlintide rate below one LSB, carried on"),
     Word("IOB_1", "mU", 8, *INT32, "insulin above schedule on board, first compartment"),
     Word("IOB_2", "mU", 8, *INT32, "insulin above schedule on board, second compartment"),
+    Word("RATE", "0.005 U/h", 0, 0, 8000, "insulin rate commanded in the last step"),
 )
 
 PARAMETERS = (
@@ -83,7 +84,7 @@ OUTPUTS = (
 
 (
     SATURATIONS, U_1, U_2, U_3, LAG_1, LAG_2, LAG_3, V_1, LEAD_1, LEAD_2, LEAD_3, GLUCOSE, PRIMED, RATE_CARRY,
-    PRAM_CARRY, IOB_1, IOB_2,
+    PRAM_CARRY, IOB_1, IOB_2, RATE,
 ) = range(len(STATE))  # fmt: skip
 (
     BASAL, TARGET, MAX_BASAL, PRAM_RATIO, MEAL_GAIN, INSULIN_GAIN, OBSERVER_GAIN, LEAD1_B0, LEAD1_B1, LEAD2_B0,
