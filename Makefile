@@ -28,7 +28,7 @@ lint: setup      ## ruff, mypy, import-linter, generated files up to date
 	tools/run_lint
 
 docs: setup      ## regenerate the generated pages of docs/
-	$(BIN)/python -m tools.generate_docs
+	$(BIN)/python tools/generate_docs.py
 
 benchmark: setup ## the speed figures, each beside its ceiling
 	$(BIN)/pumpbench benchmark

@@ -1,9 +1,11 @@
 """How fast the closed loop runs, beside what its transport would allow and what its plant costs.
 
-The ceiling of a bus is the bare exchange of the same number of frames per step in both directions between the same
-number of processes: prebuilt bytes on raw sockets, nothing packed, checked, integrated or decided. The ceiling of the
-loop in one process is the plant alone. Beside simglucose (`plant/vs-simglucose`) the "ceiling" is the peer: see
-`simglucose_peer`.
+`closed-loop/BUS` stands beside what the transport gives when every frame is a round trip of its own: raw round trips
+per second divided by the frames of a step. A ratio above 1 is the gain of handing over a step's frames as one batch.
+`closed-loop/BUS/exchange` stands beside the bare exchange of those batches, the same number of frames in both
+directions between the same number of processes, prebuilt bytes on raw sockets, nothing packed, checked, integrated or
+decided: what is missing to 1 is what plant, firmware and codec cost. The ceiling of the loop in one process is the
+plant alone. Beside simglucose (`plant/vs-simglucose`) the "ceiling" is the peer: see `simglucose_peer`.
 """
 
 import json
@@ -70,13 +72,13 @@ def _figure(name: str, values: list[float], ceilings: list[float]) -> Figure:
     )
 
 
-def closed_loop(kind: str, *, days: int, runs: int = 3) -> Figure:
+def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
     """Patient-days per second of whole runs on one kind of bus: `inproc`, `hub` or `vcan`, recorder listening.
 
     Start-up and the writing of the run folder are left out.
     """
     bus = {"vcan": "socketcan:vcan0"}.get(kind, kind)
-    values, ceilings = [], []
+    values, ceilings, exchanges = [], [], []
     with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory:
         for number in range(runs):
             out = Path(directory) / f"{kind}-{number}"
@@ -94,11 +96,13 @@ def closed_loop(kind: str, *, days: int, runs: int = 3) -> Figure:
             values.append((last - first) / STEPS_PER_DAY / (ended - started))
             if kind != "inproc":
                 to_device, back = _frames_per_step(out)
-                bare = measure(CEILING_OF[kind], 2000, to_device, back, True)
-                ceilings.append(bare.rate / STEPS_PER_DAY)
+                single = measure(CEILING_OF[kind], 2000, 1, 1, False)
+                ceilings.append(single.rate / (to_device + back) / STEPS_PER_DAY)
+                exchanges.append(measure(CEILING_OF[kind], 2000, to_device, back, True).rate / STEPS_PER_DAY)
     if kind == "inproc":
-        ceilings = [plant_alone(days=20, runs=3)[0]["value"]]
-    return _figure(f"closed-loop/{kind}", values, ceilings)
+        return [_figure("closed-loop/inproc", values, [plant_alone(days=20, runs=3)[0]["value"]])]
+    name = f"closed-loop/{kind}"
+    return [_figure(name, values, ceilings), _figure(f"{name}/exchange", values, exchanges)]
 
 
 def _frames_per_step(folder: Path) -> tuple[int, int]:
@@ -125,13 +129,13 @@ def all_figures(*, quick: bool, only_vcan: bool = False, peers: bool = True) -> 
     if only_vcan:
         return [
             *round_trips(["vcan"], steps=steps // 2, runs=runs),
-            closed_loop("vcan", days=1, runs=min(runs, 3)),
+            *closed_loop("vcan", days=1, runs=min(runs, 3)),
         ]
     figures = plant_alone(days=10 if quick else 100, runs=runs)
     if peers:
         figures += simglucose_peer.compare(runs=1 if quick else 3, days=10 if quick else 100)
     figures += round_trips(["hub"], steps=steps, runs=runs)
-    figures += [closed_loop("inproc", days=days, runs=runs), closed_loop("hub", days=days, runs=runs)]
+    figures += [*closed_loop("inproc", days=days, runs=runs), *closed_loop("hub", days=days, runs=runs)]
     if vcan_available():
         return figures + all_figures(quick=quick, only_vcan=True)
     return figures + _in_guest(quick=quick)
