@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
 from can_bus import codec, yaml_file
 from can_bus.frame import Frame
@@ -36,6 +36,11 @@ def seconds(text: Any) -> int:
     return days * 86400 + hours * 3600 + minutes * 60 + rest
 
 
+def clock(time: int) -> str:
+    """The text that `seconds` reads as this time."""
+    return f"{time // 86400}+{time // 3600 % 24:02}:{time // 60 % 60:02}:{time % 60:02}"
+
+
 def _known_message(name: Any) -> str:
     known = list(codec.messages())
     if isinstance(name, str) and name in known:
@@ -45,7 +50,7 @@ def _known_message(name: Any) -> str:
     raise ValueError(f"the DBC has no message of this name; {hint}")
 
 
-Time = Annotated[int, BeforeValidator(seconds)]
+Time = Annotated[int, BeforeValidator(seconds), PlainSerializer(clock, when_used="json")]
 MessageName = Annotated[str, BeforeValidator(_known_message)]
 
 

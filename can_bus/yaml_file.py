@@ -64,7 +64,7 @@ def _refuse_repeated_keys(path: Path, root: yaml.Node | None) -> None:
 def _problem(path: Path, root: yaml.Node | None, model: type[BaseModel], problem: object) -> str:
     assert isinstance(problem, dict)
     location = problem["loc"]
-    place = ".".join(str(part) for part in location) or "top level"
+    place = ".".join(str(part) for part in _without_kinds(root, location)) or "top level"
     found = problem.get("input")
     shown = "" if isinstance(found, dict | list) or found is None else f" (found {found!r})"
     text = problem["msg"].removeprefix("Value error, ")
@@ -75,6 +75,21 @@ def _problem(path: Path, root: yaml.Node | None, model: type[BaseModel], problem
     elif problem["type"] == "model_type":
         text = f"expected a mapping with the keys {', '.join(_keys(model, (*location, '')))}"
     return f"{path}:{_line(root, location)}: {place}: {text}{shown}"
+
+
+def _without_kinds(node: yaml.Node | None, location: Sequence[object]) -> list[object]:
+    """The location as the file has it: a pydantic union puts the chosen kind in between."""
+    kept: list[object] = []
+    for number, part in enumerate(location):
+        entries = {pair[0].value: pair[1] for pair in node.value} if isinstance(node, yaml.MappingNode) else {}
+        if isinstance(node, yaml.MappingNode) and part not in entries and number < len(location) - 1:
+            continue
+        kept.append(part)
+        if isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            node = node.value[part]
+        else:
+            node = entries.get(part) if isinstance(part, str) else None
+    return kept
 
 
 def _keys(model: type[BaseModel], location: Sequence[object]) -> list[str]:

@@ -18,6 +18,7 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
 
 from . import mechanism, physiology
+from .faults import AnyPumpFault
 from .physiology import Patient, Variability
 from .pump import REPORT, Pump, PumpSettings
 from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
@@ -71,6 +72,7 @@ class Run(NamedTuple):
     calibration: Mapping[int, int]  # CfgIndex -> raw value, the CRC of the set last
     sensor: str | SensorSettings = "coloured"
     variability: tuple[str, ...] = tuple(physiology.SOURCES)
+    faults: tuple[AnyPumpFault, ...] = ()
 
 
 class PlantServer:
@@ -217,6 +219,7 @@ class PlantServer:
         frames = self._outbox
         self._outbox = []
         frames += self._confirm_pump_alarms()
+        frames += self._fail_on_purpose()
         frames += self._pump.report_alarms(self._transmitter)
         reading = self._read_sensor()
         frames += self._sensor_status()
@@ -283,6 +286,15 @@ class PlantServer:
                     "UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"]
                 )
             )
+
+    def _fail_on_purpose(self) -> list[Frame]:
+        """Let the pump's faults act, and tell."""
+        frames = []
+        for fault in self.run.faults:
+            fault.act(self._pump, self.step)
+            if fault.active(self.step):
+                frames.append(self._transmitter.frame("FAULT_Inject", **fault.report(self.step)))
+        return frames
 
     def _confirm_pump_alarms(self) -> list[Frame]:
         """The user confirms what the pump has shown since the last step."""

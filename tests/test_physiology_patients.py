@@ -58,7 +58,8 @@ def test_a_patient_cannot_be_changed_by_accident():
 
 def test_pramlintide_sets():
     assert physiology.pramlintide_sets() == ("P2", "P4", "moderate", "conservative", "strong")
-    p2 = load_patient("adult#001").params
+    p2 = load_patient("adult#001", pramlintide="P2").params
+    assert (load_patient("adult#001").params == load_patient("adult#001", pramlintide="P4").params).all()
     moderate = load_patient("adult#001", pramlintide="moderate").params
     type1 = load_patient("adult#001", pramlintide="moderate+type1").params
     assert [p2[par.INDEX[name]] for name in ("n", "d", "e", "ka")] == [40.0, 1000.0, 3.0, 0.012]

@@ -130,7 +130,7 @@ def load_patient(
     name: str,
     *,
     basal_glucose: float | None = 120.0,
-    pramlintide: str = "P2",
+    pramlintide: str = "P4",
     physiology: str | None = None,
 ) -> Patient:
     """Load a virtual patient.
@@ -138,7 +138,8 @@ def load_patient(
     Args:
         name: one of `cohort()`, or `path/to/file.csv#name` for a file of your own (docs/physiology.md).
         basal_glucose: glucose of the operating point, mg/dL; None for the patient's own (column Gb).
-        pramlintide: name of a parameter set (data/pramlintide.csv), with `+type1` for the bioavailability
+        pramlintide: name of a parameter set (data/pramlintide.csv; the default is the one from public data alone, the
+            paper's study asks for the calibrated `P2`), with `+type1` for the bioavailability
             seen in type 1 diabetes.
         physiology: "S2008" or "S2013"; None for what the file says.
 

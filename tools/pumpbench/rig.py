@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import dbc
-from can_bus.faults import Fault, load_faults
 from can_bus.frame import Frame
 from can_bus.gateway import Gateway
 from can_bus.hub import Hub
@@ -43,6 +42,8 @@ from plant_server.server import PlantServer, Run
 from pumpbench import __version__
 from pumpbench.calibration import MODES, calibrate
 from pumpbench.capture import Capture
+from pumpbench.faults import Faults, write_wire
+from pumpbench.faults import load as load_fault_file
 from pumpbench.recorder import write
 from pumpbench.runfolder import RunFolder
 
@@ -92,7 +93,7 @@ class Prepared:
 
     request: Request
     run: Run
-    faults: tuple[Fault, ...]
+    faults: Faults
     info: dict[str, Any]
 
 
@@ -135,11 +136,12 @@ def prepare(request: Request) -> Prepared:
         raise RigError(
             f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
         )
-    faults = load_faults(request.faults) if request.faults else ()
+    faults = load_fault_file(request.faults) if request.faults else Faults()
     calibration = calibrate(patient)
     sensor = load_sensor(request.sensor)
     mode = MODES[request.strategy]
-    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability)
+    sensor = sensor.model_copy(update={"effects": (*sensor.effects, *faults.sensor)})
+    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, faults.pump)
     PlantServer(run)  # checks the rest
     info = {
         "pumpbench": __version__,
@@ -159,7 +161,7 @@ def prepare(request: Request) -> Prepared:
         "sensor": request.sensor,
         "bus": request.bus,
         "firmware": request.firmware or "built-in",
-        "faults": [fault.model_dump() for fault in faults],
+        "faults": faults.as_json(),
         "parameters": {
             "patient_sha256": _sha256(patient.params.tobytes() + patient.x0.tobytes()),
             "scenario_sha256": _sha256(repr((scenario.meals, scenario.announcing, scenario.rescue)).encode()),
@@ -238,7 +240,7 @@ def _in_process(prepared: Prepared, folder: RunFolder) -> Path:
 
     request = prepared.request
     capture = Capture()
-    gateway = Gateway(prepared.faults) if prepared.faults else None
+    gateway = Gateway(prepared.faults.wire) if prepared.faults.wire else None
     Wires(PlantServer(prepared.run), Firmware(), gateway, capture).run(request.progress)
     write(folder, capture, prepared.info, complete=True)
     return request.out
@@ -368,11 +370,11 @@ def _processes(prepared: Prepared) -> Path:
             plant_url = f"unix:{place / 'plant.sock'}"
             hub = stack.enter_context(Hub(plant_url))
             link: Link = stack.enter_context(hub.local_link())
-            device_url = f"unix:{place / 'device.sock'}" if prepared.faults else plant_url
+            device_url = f"unix:{place / 'device.sock'}" if prepared.faults.wire else plant_url
         else:
             plant_url = request.bus
             device_url = plant_url
-            if prepared.faults:
+            if prepared.faults.wire:
                 device_url = request.device_bus or _second_bus(plant_url)
             link = stack.enter_context(open_link(plant_url))
 
@@ -419,15 +421,17 @@ def _start_recorder_side(
 ) -> Child:
     """Start the gateway, if there are faults, and the recorder."""
     request = prepared.request
-    if prepared.faults:
+    if prepared.faults.wire:
+        wire = place / "faults.yaml"
+        write_wire(prepared.faults, wire)
         command = [sys.executable, "-m", "can_bus.gateway", "--plant", plant_url, "--device", device_url]
-        command += ["--faults", str(request.faults)]
+        command += ["--faults", str(wire)]
         start("gateway", [*command, "--host"] if hosted else command, ready=True)
     info = place / "info.json"
     info.write_text(json.dumps(prepared.info), encoding="utf-8")
     command = [sys.executable, "-m", "pumpbench.recorder", "--bus", device_url, "--out", str(request.out)]
     command += ["--info", str(info), "--overwrite"]
-    if prepared.faults:
+    if prepared.faults.wire:
         command += ["--plant-bus", plant_url]
     return start("recorder", command, ready=True)
 
