@@ -104,3 +104,14 @@ def test_a_wrong_name_is_a_usage_error(
     assert len(done.stderr.splitlines()) == 1
     assert all(word in done.stderr for word in words)
     assert not (runs / "run").exists()
+
+
+def test_a_patient_of_an_own_file_is_not_given_somebody_elses_controller(pumpbench: Pumpbench, runs: Path) -> None:
+    from plant_server.physiology import patients
+
+    own = runs / "own.csv"
+    own.write_text(Path(patients.__file__).with_name("data").joinpath("adults.csv").read_text())
+    done = pumpbench("run", "--patient", f"{own}#adult#001", "--bus", "inproc", "--out", runs / "out")
+    assert done.returncode == 2
+    assert "there is no controller model for patients of your own files yet" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

@@ -34,13 +34,13 @@ from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.lockstep import Node
 from can_bus.url import open_link
-from plant_server.physiology import SOURCES, load_patient
+from plant_server.physiology import SOURCES, cohort, load_patient
 from plant_server.scenario import load_scenario
 from plant_server.sensor import load_sensor
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
 from pumpbench import __version__
-from pumpbench.calibration import MODES, calibrate
+from pumpbench.calibration import MODES, CalibrationError, calibrate
 from pumpbench.capture import Capture
 from pumpbench.faults import Faults, write_wire
 from pumpbench.faults import load as load_fault_file
@@ -137,6 +137,11 @@ def prepare(request: Request) -> Prepared:
             f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
         )
     faults = load_fault_file(request.faults) if request.faults else Faults()
+    if request.patient not in cohort():
+        raise CalibrationError(
+            f"{request.patient}: there is no controller model for patients of your own files yet; "
+            f"the closed loop knows {', '.join(cohort())}"
+        )
     calibration = calibrate(patient)
     sensor = load_sensor(request.sensor)
     mode = MODES[request.strategy]
