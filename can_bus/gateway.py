@@ -9,22 +9,21 @@ call passes untouched: faults begin with the calibration.
 """
 
 import argparse
+import contextlib
 import enum
 import select
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import can
-
-from can_bus import codec, yaml_file
-from can_bus.codec import CodecError
+from can_bus import codec
 from can_bus.faults import Fault, Injector, load_faults
 from can_bus.frame import Frame
 from can_bus.hub import Hub
-from can_bus.link import BusLost, Link
+from can_bus.link import Link
 from can_bus.lockstep import STEP_SECONDS, Done, Phase
-from can_bus.url import BusUrlError, open_link
+from can_bus.process import exit_status
+from can_bus.url import open_link
 
 
 class Side(enum.IntEnum):
@@ -130,27 +129,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--host", action="store_true", help="serve the device's bus as a hub, from this process")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="YAML file of faults")
     options = parser.parse_args(arguments)
-    try:
-        faults = load_faults(options.faults) if options.faults else ()
-        gateway = Gateway(faults)
-        with open_link(options.plant) as plant:
-            if options.host:
-                with Hub(options.device) as hub, hub.local_link() as device:
-                    print("ready", flush=True)
-                    serve(gateway, device, plant)
-            else:
-                with open_link(options.device) as device:
-                    print("ready", flush=True)
-                    serve(gateway, device, plant)
-    except (BusUrlError, CodecError, yaml_file.FileError) as error:
-        print(f"gateway: {error}", file=sys.stderr)
-        return 2
-    except (BusLost, can.CanError, OSError) as error:
-        print(f"gateway: {error}", file=sys.stderr)
-        return 3
-    except KeyboardInterrupt:
-        return 130
-    return 0
+    return exit_status("gateway", lambda: _join(options))
+
+
+def _join(options: argparse.Namespace) -> None:
+    gateway = Gateway(load_faults(options.faults) if options.faults else ())
+    with contextlib.ExitStack() as stack:
+        plant = stack.enter_context(open_link(options.plant))
+        if options.host:
+            device: Link = stack.enter_context(stack.enter_context(Hub(options.device)).local_link())
+        else:
+            device = stack.enter_context(open_link(options.device))
+        print("ready", flush=True)
+        serve(gateway, device, plant)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 
 STEP_SECONDS = 300
+STEPS_PER_DAY = 86400 // STEP_SECONDS
 TURNS_PER_STEP = 32
 """Further turns a device may ask for in one instant before the plant calls it stuck."""
 

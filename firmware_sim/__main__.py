@@ -1,6 +1,6 @@
 """The firmware as a process: `python -m firmware_sim --bus URL`.
 
-It waits for the bench's roll call, runs as many runs as the bench starts on this bus, and ends with the first one.
+It waits for the bench's roll call, does one run, and ends with it.
 """
 
 import argparse
@@ -8,11 +8,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-import can
-
-from can_bus.codec import CodecError, message
-from can_bus.link import BusLost
-from can_bus.url import BusUrlError, open_link
+from can_bus.codec import message
+from can_bus.process import exit_status
+from can_bus.url import open_link
 
 from .firmware import Firmware, subscriptions
 
@@ -42,17 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not options.bus:
         parser.error("--bus URL is needed, e.g. socketcan:vcan0, unix:/run/bench.sock")
-    try:
-        serve(options.bus)
-    except (BusUrlError, CodecError) as error:
-        print(f"firmware_sim: {error}", file=sys.stderr)
-        return 2
-    except (BusLost, can.CanError, OSError) as error:
-        print(f"firmware_sim: {error}", file=sys.stderr)
-        return 3
-    except KeyboardInterrupt:
-        return 130
-    return 0
+    return exit_status("firmware_sim", lambda: serve(options.bus))
 
 
 if __name__ == "__main__":

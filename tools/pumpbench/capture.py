@@ -30,14 +30,12 @@ from can_bus.frame import (
     Frame,
     pack,
 )
+from can_bus.lockstep import STEP_SECONDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[Any]
-
-STEP_SECONDS: Final = 300
-"""Simulated seconds from one sampling instant to the next."""
 
 FRAME_MICROSECONDS: Final = 250
 """Simulated time between two frames of a turn, about what a frame takes at 500 kbit/s."""

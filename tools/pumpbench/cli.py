@@ -91,6 +91,7 @@ def run(
     step_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware in a step.")] = 10.0,
 ) -> None:
     """Run the closed loop: patient, firmware and recorder on one bus. Exit status 1 if a hazard was counted."""
+    from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
     from pumpbench import rig  # noqa: PLC0415
 
     names = _patients(patient)
@@ -101,7 +102,7 @@ def run(
             out=_run_folder(out, name, len(names) > 1, f"{strategy}-{scenario}-{days:g}d-seed{seed}"),
             strategy=strategy,
             scenario=scenario,
-            steps=round(days * rig.STEPS_PER_DAY),
+            steps=round(days * STEPS_PER_DAY),
             seed=seed,
             bus=bus,
             device_bus=device_bus,
@@ -227,6 +228,7 @@ def plant(
     import contextlib  # noqa: PLC0415
 
     from can_bus.hub import Hub  # noqa: PLC0415
+    from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
     from can_bus.url import open_link  # noqa: PLC0415
     from plant_server.serve import serve  # noqa: PLC0415
     from plant_server.server import PlantServer  # noqa: PLC0415
@@ -237,7 +239,7 @@ def plant(
         out=Path(),
         strategy=strategy,
         scenario=scenario,
-        steps=round(days * rig.STEPS_PER_DAY),
+        steps=round(days * STEPS_PER_DAY),
         seed=seed,
         sensor=sensor,
         bus=bus,

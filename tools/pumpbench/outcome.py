@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from can_bus.lockstep import STEPS_PER_DAY
 from plant_server.mechanism import INSULIN_STROKE_U, PRAMLINTIDE_STROKE_UG
 from plant_server.metrics import glycaemic
 from pumpbench.hazards import Monitor
@@ -11,8 +12,6 @@ from pumpbench.hazards import Monitor
 if TYPE_CHECKING:
     from pumpbench.capture import Frames
     from pumpbench.trace import Trace
-
-STEPS_PER_DAY = 288
 
 
 def _last(column: Any) -> float:

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from can_bus import codec
-from pumpbench.capture import STEP_SECONDS, Frames
+from can_bus.lockstep import STEP_SECONDS
+from pumpbench.capture import Frames
 from pumpbench.trace import Trace, decode, labels, signals
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ from can_bus.frame import Frame
 from can_bus.gateway import Gateway
 from can_bus.hub import Hub
 from can_bus.link import Link
-from can_bus.lockstep import Node
+from can_bus.lockstep import STEPS_PER_DAY, Node
 from can_bus.url import open_link
 from plant_server.physiology import SOURCES, cohort, load_patient
 from plant_server.scenario import load_scenario
@@ -47,7 +47,6 @@ from pumpbench.faults import load as load_fault_file
 from pumpbench.recorder import write
 from pumpbench.runfolder import RunFolder
 
-STEPS_PER_DAY = 288
 READY_SECONDS = 30.0
 END_SECONDS = 5.0
 WRITE_SECONDS = 600.0

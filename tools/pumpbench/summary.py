@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from pumpbench.capture import STEP_SECONDS
+from can_bus.lockstep import STEP_SECONDS
 from pumpbench.recording import GREEN, LANES, STATE_COLOURS, clock, state_changes, title
 from pumpbench.trace import Trace
 

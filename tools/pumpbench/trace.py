@@ -22,7 +22,8 @@ import numpy as np
 
 import dbc
 from can_bus import codec
-from pumpbench.capture import STEP_SECONDS, Frames
+from can_bus.lockstep import STEP_SECONDS
+from pumpbench.capture import Frames
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -19,6 +19,7 @@ from statistics import median
 import numpy as np
 
 from can_bus import codec
+from can_bus.lockstep import STEPS_PER_DAY
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from pumpbench import rig
@@ -26,7 +27,6 @@ from pumpbench.benchmark import simglucose_peer
 from pumpbench.benchmark.round_trips import CEILING_OF, Figure, measure, round_trips, vcan_available
 from pumpbench.trace import decode
 
-STEPS_PER_DAY = rig.STEPS_PER_DAY
 PATIENT = "adult#002"
 STRATEGY = "s2"
 WITH_VCAN = Path(__file__).parents[3] / "tools" / "with_vcan"
