@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import mechanism
-from .mechanism import AIR, DELIVERED, FLUID, HELD
+from .mechanism import AIR, DELIVERED, FLUID, HELD, PENDING
 
 
 class Occlusion(enum.IntEnum):
@@ -85,15 +85,29 @@ class Chamber:
         return bool(self.words[FLUID] == 0)
 
     @property
+    def available(self) -> int:
+        """Strokes in the reservoir that nothing has been commanded of yet."""
+        return max(int(self.words[FLUID] - (self.words[PENDING] - self.words[HELD])), 0)
+
+    @property
     def delivered(self) -> int:
         """Strokes that have reached the patient."""
         return int(self.words[DELIVERED])
 
-    def run(self, rate: int) -> npt.NDArray[np.float64]:
-        """Run the motor for a sampling interval; the amounts within each 30-s step, in an array that is used again."""
+    def run(self, rate: int, *, halted: bool = False) -> npt.NDArray[np.float64]:
+        """Run the motor for a sampling interval.
+
+        Args:
+            rate: see `mechanism.run`.
+            halted: the pump is suspended or has no power: no stroke is made, and what waits for the motor is lost.
+
+        Returns:
+            The amounts within each 30-s step, in an array that is used again.
+        """
         settings = self.settings
+        stopped = self.stopped or halted
         mechanism.run(
-            self.words, rate, settings.stroke_units, settings.stroke_volume, self.occluded, self.stopped, self._out
+            self.words, rate, settings.stroke_units, settings.stroke_volume, self.occluded, stopped, self._out
         )
         if self.words[HELD] >= settings.occluded_at:
             self.stopped = True

@@ -3,6 +3,9 @@
 For each drug, in strokes and at every instant: commanded = delivered + pending + lost. A rate fills an accumulator in
 exact integer units; a full accumulator is one commanded stroke. Strokes are made on the 30-s grid of the plant. A made
 stroke reaches the patient, is held back by an occlusion (and stays pending), or was air (and is lost).
+
+The strokes of a bolus are commanded all at once and made before those of the rate. They are followed apart, so that
+what of a bolus has reached the patient is exact whatever happens to the line.
 """
 
 import numpy as np
@@ -24,16 +27,17 @@ PRAMLINTIDE_STROKE = 600
 STROKES_PER_SUBSTEP = 15
 """Fastest motor: a stroke every 2 s, 1.5 U/min of insulin (the order of commercial pumps)."""
 
-ACCUMULATED, COMMANDED, PENDING, DELIVERED, LOST, HELD, FLUID, AIR = range(8)
+ACCUMULATED, COMMANDED, PENDING, DELIVERED, LOST, HELD, FLUID, AIR, BOLUS, BOLUS_HELD, BOLUS_DELIVERED = range(11)
 """Words of one drug's motor, in strokes but for the first: HELD is the part of PENDING that an occlusion holds back in
-the line, FLUID what is left in the reservoir, AIR what of the line is air."""
+the line, FLUID what is left in the reservoir, AIR what of the line is air. Of the newest bolus BOLUS is what is not
+made yet (a part of PENDING), BOLUS_HELD its part of HELD, BOLUS_DELIVERED its part of DELIVERED."""
 
 Words = npt.NDArray[np.int64]
 
 
 def motor(fluid: int) -> Words:
     """A motor at rest that has delivered nothing, with `fluid` strokes in its reservoir."""
-    words = np.zeros(8, dtype=np.int64)
+    words = np.zeros(11, dtype=np.int64)
     words[FLUID] = fluid
     return words
 
@@ -70,6 +74,7 @@ def run(
             waiting = words[PENDING] - words[HELD]
             words[PENDING] -= waiting
             words[LOST] += waiting
+            words[BOLUS] = 0
         else:
             made = min(words[PENDING] - words[HELD], STROKES_PER_SUBSTEP)
             air = min(made, words[AIR])
@@ -79,22 +84,43 @@ def run(
             words[PENDING] -= made - fluid
             words[LOST] += made - fluid
             words[HELD] += fluid
+            of_bolus = min(made, words[BOLUS])
+            words[BOLUS] -= of_bolus
+            words[BOLUS_HELD] += min(max(of_bolus - air, 0), fluid)
         if not blocked:
             arrived = words[HELD]
             words[HELD] = 0
+            words[BOLUS_DELIVERED] += words[BOLUS_HELD]
+            words[BOLUS_HELD] = 0
             words[PENDING] -= arrived
             words[DELIVERED] += arrived
         out[i] = arrived * volume
+
+
+def begin_bolus(words: Words, strokes: int) -> None:
+    """Command the strokes of a bolus at once; the motor makes them as fast as it can. The last one must be over."""
+    words[COMMANDED] += strokes
+    words[PENDING] += strokes
+    words[BOLUS] = strokes
+    words[BOLUS_HELD] = words[BOLUS_DELIVERED] = 0
+
+
+def end_bolus(words: Words) -> None:
+    """What of the bolus is not made yet is lost, and never caught up."""
+    words[PENDING] -= words[BOLUS]
+    words[LOST] += words[BOLUS]
+    words[BOLUS] = 0
 
 
 def lose_held(words: Words) -> None:
     """What an occlusion held back is lost, e.g. because the user changes the infusion set."""
     words[PENDING] -= words[HELD]
     words[LOST] += words[HELD]
-    words[HELD] = 0
+    words[HELD] = words[BOLUS_HELD] = 0
 
 
 def ledger_closes(words: Words) -> bool:
     """Whether every stroke is accounted for."""
-    _, commanded, pending, delivered, lost, held, _, _ = words.tolist()
-    return bool(commanded == delivered + pending + lost and 0 <= held <= pending and lost >= 0)
+    _, commanded, pending, delivered, lost, held, _, _, bolus, bolus_held, _ = words.tolist()
+    parts = 0 <= bolus <= pending - held and 0 <= bolus_held <= held
+    return bool(commanded == delivered + pending + lost and 0 <= held <= pending and lost >= 0 and parts)

@@ -15,6 +15,8 @@ from can_bus.batch import Layout
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 
+from .bolus import AckResult, DrugBolus
+from .bolus import Op as BolusOp
 from .chamber import INSULIN, PRAMLINTIDE, Chamber, ChamberSettings, Occlusion
 from .mechanism import SUBSTEPS
 
@@ -24,6 +26,15 @@ EXPIRY_AHEAD_MAX = 24
 
 RATE_RESERVED = 8000
 """Raw rates above this are reserved codes."""
+
+BOOT_COUNTS = 15
+"""PumpBootCount runs from 0 to 14; 15 is SNA."""
+
+HEARTBEAT_BOOTS = 32
+"""HB_PUMP.BootPump runs from 0 to 31."""
+
+NMT_BOOT_UP, NMT_OPERATIONAL = 0, 5
+"""HB_PUMP.NmtPump and HB_CGM.NmtCgm, as CANopen numbers them."""
 
 MILLIUNITS_PER_LSB = 5
 """InsulinRate is in 0.005 U/h, the schedule and the motor count 0.001 U/h."""
@@ -40,7 +51,13 @@ class Op(enum.IntEnum):
 class AckFor(enum.IntEnum):
     """PUMP_Ack.AckFor."""
 
+    NONE = 0
     INSULIN_RATE = 1
+    INSULIN_BOLUS_PROGRAM = 2
+    INSULIN_BOLUS_COMMIT = 3
+    PRAM_BOLUS_PROGRAM = 4
+    PRAM_BOLUS_COMMIT = 5
+    CANCEL = 6
     PRAM_RATE = 8
 
 
@@ -72,6 +89,22 @@ AUX_INSULIN, AUX_PRAMLINTIDE, AUX_PUMP = 1, 2, 0
 
 BATTERY_LOW_PERCENT = 20
 
+HORMONE_INSULIN, HORMONE_PRAMLINTIDE = 1, 2
+"""PUMP_BolusCmd.BolusHormone."""
+
+BOLUS_DOSE = {HORMONE_INSULIN: "InsulinBolus", HORMONE_PRAMLINTIDE: "PramlintideBolus"}
+
+BOLUS_ACKS: dict[tuple[int, int], AckFor] = {
+    (HORMONE_INSULIN, BolusOp.PROGRAM): AckFor.INSULIN_BOLUS_PROGRAM,
+    (HORMONE_INSULIN, BolusOp.COMMIT): AckFor.INSULIN_BOLUS_COMMIT,
+    (HORMONE_PRAMLINTIDE, BolusOp.PROGRAM): AckFor.PRAM_BOLUS_PROGRAM,
+    (HORMONE_PRAMLINTIDE, BolusOp.COMMIT): AckFor.PRAM_BOLUS_COMMIT,
+    (HORMONE_INSULIN, BolusOp.CANCEL): AckFor.CANCEL,
+    (HORMONE_PRAMLINTIDE, BolusOp.CANCEL): AckFor.CANCEL,
+}
+
+BOLUS_STATE = ("BolusPhase", "BolusStateId", "BolusDeliveredRaw", "BolusProgrammedRaw")
+
 REPORT: Layout = (
     (
         "PUMP_Status",
@@ -81,22 +114,11 @@ REPORT: Layout = (
         ),
         {},
     ),
-    ("PUMP_Delivered", ("InsulinTotal", "PramTotal"), {"PumpBootCount": 0}),
-    ("PUMP_BolusState", (), {"BolusStateHormone": 1, "BolusPhase": 0, "BolusDeliveredRaw": 0}),
-    ("PUMP_BolusState", (), {"BolusStateHormone": 2, "BolusPhase": 0, "BolusDeliveredRaw": 0}),
+    ("PUMP_Delivered", ("PumpBootCount", "InsulinTotal", "PramTotal"), {}),
+    ("PUMP_BolusState", BOLUS_STATE, {"BolusStateHormone": 1}),
+    ("PUMP_BolusState", BOLUS_STATE, {"BolusStateHormone": 2}),
 )  # fmt: skip
 """What the pump says in every step; `Pump.values` are the raw values."""
-
-
-class AckResult(enum.IntEnum):
-    """PUMP_Ack.AckResult."""
-
-    ACCEPTED = 0
-    DUPLICATE = 1
-    EXPIRED = 2
-    OVER_LIMIT = 3
-    WRONG_STATE = 4
-    MALFORMED = 7
 
 
 class PumpState(enum.IntEnum):
@@ -115,6 +137,8 @@ class PumpSettings:
     basal_milliunits_per_h: int  # stored schedule, 0.001 U/h
     max_rate_raw: int = 6000  # 30 U/h, the largest rate of commercial pumps
     max_pramlintide_rate_raw: int = 3000  # 300 ug/h: 10 ug/U at the largest insulin rate
+    max_bolus_raw: int = 3000  # 30 U, the largest bolus of commercial pumps
+    max_pramlintide_bolus_raw: int = 1200  # 120 ug, the largest labelled dose
     insulin: ChamberSettings = INSULIN
     pramlintide: ChamberSettings = PRAMLINTIDE
     coformulation_ug_per_u: float | None = None  # one chamber with both drugs in it; None: two chambers
@@ -141,6 +165,13 @@ class Pump:
         self._alarms: dict[tuple[Alarm, int], list[int]] = {}  # (code, drug) -> [instance, state, told]
         self._next_instance = 0
         self._mixed = np.zeros(SUBSTEPS)
+        self.boots = 0
+        self._booted = False  # the next heartbeat is the first one after a reset
+        self._base = (0, 0)  # strokes delivered before the last reset of the electronics
+        self.boluses = {
+            HORMONE_INSULIN: DrugBolus(self.insulin, settings.max_bolus_raw),
+            HORMONE_PRAMLINTIDE: DrugBolus(self.pramlintide, settings.max_pramlintide_bolus_raw),
+        }
 
     # ---- commands
 
@@ -165,6 +196,43 @@ class Pump:
                 (AckFor.PRAM_RATE, results[1], pramlintide, limits[1]),
             )
         ]
+
+    def bolus(self, values: dict[str, int], step: int, transmitter: Transmitter) -> list[Frame]:
+        """Take a decoded PUMP_BolusCmd in instant `step`; return its acknowledgement."""
+        self._expire(step)
+        hormone, operation, number = values["BolusHormone"], values["BolusOp"], values["BolusId"]
+        purpose = BOLUS_ACKS.get((hormone, operation), AckFor.NONE)
+        result, echo, limit = AckResult.MALFORMED, 0, 0
+        if hormone in BOLUS_DOSE:
+            bolus, dose = self.boluses[hormone], values[BOLUS_DOSE[hormone]]
+            result, echo = bolus.judge(
+                operation, number, dose, values["BolusUntilStep"], step, ready=self._gives_bolus(hormone)
+            )
+            limit = bolus.limit_raw
+        return [
+            transmitter.frame(
+                "PUMP_Ack", AckFor=purpose, AckResult=result, AckId=number, AckEchoRaw=echo, AckLimitRaw=limit
+            )
+        ]
+
+    def _gives_bolus(self, hormone: int) -> bool:
+        """Whether a bolus of this drug can be given as things stand."""
+        mixed = self.settings.coformulation_ug_per_u is not None
+        if mixed and hormone == HORMONE_PRAMLINTIDE:
+            return False
+        return self.powered and not self._suspended and not self.boluses[hormone].chamber.stopped
+
+    def reset(self) -> None:
+        """The electronics start anew: totals from zero, boluses ended, the schedule.
+
+        The numbers of the last set-point and the newest boluses are kept, so that nothing can be given once more.
+        """
+        self.boots += 1
+        self._booted = True
+        self._base = self.insulin.delivered, self.pramlintide.delivered
+        for bolus in self.boluses.values():
+            bolus.abort()
+        self._fall_back()
 
     def _judge(self, values: dict[str, int], step: int) -> tuple[AckResult, AckResult] | None:
         number = values["BasalCmdSeq"]
@@ -214,11 +282,18 @@ class Pump:
         self._suspended = operation == Op.SUSPEND
         if self._suspended:
             self._rate = self._pramlintide_rate = 0
+            for bolus in self.boluses.values():
+                bolus.abort()
             return
         # a drug whose rate was refused falls back, the other one goes on
         accepted = [result == AckResult.ACCEPTED for result in results]
         self._rate = values["InsulinRate"] * MILLIUNITS_PER_LSB if accepted[0] else self.settings.basal_milliunits_per_h
         self._pramlintide_rate = values["PramlintideRate"] if accepted[1] else 0
+
+    def _expire(self, step: int) -> None:
+        """Nothing is obeyed beyond its expiry."""
+        if self._commanded and step > self._expires:
+            self._fall_back()
 
     def _fall_back(self) -> None:
         """The stored schedule of insulin, no pramlintide."""
@@ -241,15 +316,20 @@ class Pump:
             Insulin (U) and pramlintide (ug) that reach the patient within each of the ten 30-s steps; the arrays are
             used again.
         """
-        if self._commanded and step > self._expires:
-            self._fall_back()
+        self._expire(step)
         rate, pramlintide_rate = (self._rate, self._pramlintide_rate) if self.powered else (0, 0)
-        insulin = self.insulin.run(rate)
+        halted = self._suspended or not self.powered
+        if halted:
+            for bolus in self.boluses.values():
+                bolus.abort()
+        insulin = self.insulin.run(rate, halted=halted)
         ratio = self.settings.coformulation_ug_per_u
         if ratio is None:
-            pramlintide = self.pramlintide.run(pramlintide_rate)
+            pramlintide = self.pramlintide.run(pramlintide_rate, halted=halted)
         else:
             pramlintide = np.multiply(insulin, ratio, out=self._mixed)
+        for bolus in self.boluses.values():
+            bolus.follow()
         self._age(step + 1)
         return insulin, pramlintide
 
@@ -277,12 +357,14 @@ class Pump:
         """The raw values of `REPORT` as they stand."""
         insulin, pramlintide = self.insulin, self.pramlintide
         ratio = self.settings.coformulation_ug_per_u
+        insulin_total = (insulin.delivered - self._base[0]) * insulin.settings.stroke_volume
         if ratio is None:
-            pram_left, pram_total = pramlintide.remaining, pramlintide.delivered * pramlintide.settings.stroke_volume
+            pram_left = pramlintide.remaining
+            pram_total = (pramlintide.delivered - self._base[1]) * pramlintide.settings.stroke_volume
             pram_occlusion = pramlintide.occlusion
         else:
             pram_left = insulin.remaining * ratio
-            pram_total = insulin.delivered * insulin.settings.stroke_volume * ratio
+            pram_total = insulin_total * ratio
             pram_occlusion = insulin.occlusion
         return (
             self._state(),
@@ -293,9 +375,18 @@ class Pump:
             insulin.occlusion,
             pram_occlusion,
             int(self._commanded),
-            round(insulin.delivered * insulin.settings.stroke_volume * 1000),
+            self.boots % BOOT_COUNTS,
+            round(insulin_total * 1000),
             round(pram_total * 100),
+            *self.boluses[HORMONE_INSULIN].state(),
+            *self.boluses[HORMONE_PRAMLINTIDE].state(),
         )
+
+    def heartbeat(self) -> tuple[int, int]:
+        """NmtPump and BootPump of the next HB_PUMP."""
+        state = NMT_BOOT_UP if self._booted else NMT_OPERATIONAL
+        self._booted = False
+        return state, self.boots % HEARTBEAT_BOOTS
 
     def _state(self) -> PumpState:
         if not self.powered or self.insulin.stopped:
