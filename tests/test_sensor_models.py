@@ -45,8 +45,8 @@ def correlation(x: np.ndarray, lag: int) -> float:
     [
         ("coloured", 1, "adult#001", [-1.1853342482893794, -0.6782227934162559], "7e0bb2ba8d78a5ec"),
         ("coloured", 7, "adult#009", [-2.4779310276925983, -6.237430359545419], "738bdf18d66d096c"),
-        ("breton", 1, "adult#001", [-19.603954531176292, -14.81391148851046], "f53012c4b806ddc1"),
-        ("breton", 7, "adult#009", [-4.773327484338801, -4.654907341324841], "658978f4cde8ca9e"),
+        ("breton", 1, "adult#001", [-19.603954414999485, -14.81391125562191], "7e4bf7c5b31f4a54"),
+        ("breton", 7, "adult#009", [-4.77332714304924, -4.654907011270523], "945cdcc3e6f684ec"),
     ],
 )
 def test_the_random_numbers_stay_the_same(name: str, seed: int, patient: str, start: list[float], sha256: str) -> None:

@@ -142,7 +142,9 @@ def fit(residuals: Callable[[Array], Array], starts: Iterable[Array], low: Array
             gtol=1e-10,
         )
         found.append((2.0 * solution.cost, solution))
-    found.sort(key=lambda each: each[0])
+    # Kinetics can have two minima of exactly the same cost (rates that change places): rounding, which differs between
+    # processors, must not decide between them.
+    found.sort(key=lambda each: (round(each[0], 6), tuple(-np.round(each[1].x, 3))))
     cost, best = found[0]
     return Fit(np.exp(best.x), cost, best.jac, tuple(each[0] for each in found))
 
