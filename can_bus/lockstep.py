@@ -73,10 +73,15 @@ class Turn:
         """Queue a frame for this turn."""
         self._frames.append(self.transmitter.frame(name, **values))
 
-    def close(self, step: int, status: Done = Done.OK) -> list[Frame]:
-        """All queued frames and SYNC_Done, whose TxCount counts them and itself."""
+    def take(self) -> list[Frame]:
+        """All queued frames, for what is said out of turn: the heartbeat of a device that has just started."""
         frames = self._frames
         self._frames = []
+        return frames
+
+    def close(self, step: int, status: Done = Done.OK) -> list[Frame]:
+        """All queued frames and SYNC_Done, whose TxCount counts them and itself."""
+        frames = self.take()
         done = self.transmitter.frame(
             "SYNC_Done", DoneStatus=status, DoneStepIndex=step, TxCount=min(len(frames) + 1, 254)
         )

@@ -1,6 +1,7 @@
 """Alarms: one frame per change of state, repeated every step until the user has confirmed it."""
 
 import enum
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from can_bus.lockstep import Turn
@@ -16,8 +17,12 @@ class Code(enum.IntEnum):
     DOSE_LIMITED = 10
     DOSE_REJECTED = 11
     E2E_FAULT = 12
+    WATCHDOG = 13
     SELF_TEST = 14
+    URGENT_LOW = 15
     NODE_RESET = 18
+    CLOCK_JUMP = 19
+    STATE_CHANGE = 20
 
 
 class State(enum.IntEnum):
@@ -46,8 +51,12 @@ PRIORITY = {
     Code.DOSE_LIMITED: Priority.LOW,
     Code.DOSE_REJECTED: Priority.LOW,
     Code.E2E_FAULT: Priority.MEDIUM,
+    Code.WATCHDOG: Priority.HIGH,
     Code.SELF_TEST: Priority.HIGH,
+    Code.URGENT_LOW: Priority.HIGH,
     Code.NODE_RESET: Priority.INFO,
+    Code.CLOCK_JUMP: Priority.LOW,
+    Code.STATE_CHANGE: Priority.INFO,
 }
 
 STEPS_AT_LEAST = 6
@@ -105,6 +114,14 @@ class Alarms:
         """Send this alarm in the next report even if nothing about it has changed."""
         if code in self._active:
             self._active[code].changed = True
+
+    def save(self) -> list[int]:
+        """Words for the non-volatile memory: instances are not used twice."""
+        return [self._next_instance]
+
+    def restore(self, words: Iterator[int]) -> None:
+        """Take back what `save` wrote; causes that still hold raise their alarms anew."""
+        self._next_instance = next(words)
 
     def report(self, turn: Turn) -> None:
         """Send what changed and what is pending, highest priority first; forget what has ended."""

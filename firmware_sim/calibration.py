@@ -1,6 +1,7 @@
 """The calibration of one patient: flashed parameter by parameter, checked as a set, active as a whole."""
 
 import binascii
+from collections.abc import Iterator
 
 from can_bus import codec
 
@@ -31,13 +32,53 @@ CORE = {
     "INSULIN_B1": "CfgInsulinB1",
     "INSULIN_B2": "CfgInsulinB2",
     "INSULIN_B3": "CfgInsulinB3",
+    "CARB_RATIO": "CfgCarbRatio",
+    "MAX_BOLUS": "CfgMaxBolus",
+    "MAX_IOB": "CfgMaxIob",
+    "PRAM_BOLUS": "CfgPramBolus",
+    "BOLUS_DEDUCTION": "CfgBolusDeduction",
+    "MEAL_FACTOR": "CfgMealFactor",
+    "ASSUMED_CARBS": "CfgAssumedCarbs",
+    "FILTER_A1": "CfgFilterA1",
+    "FILTER_A2": "CfgFilterA2",
+    "FILTER_A3": "CfgFilterA3",
+    "FILTER_B1": "CfgFilterB1",
+    "FILTER_B2": "CfgFilterB2",
+    "FILTER_B3": "CfgFilterB3",
+    "PEAK_RATIO": "CfgPeakRatio",
+    "PEAK_SLOPE": "CfgPeakSlope",
+    "PEAK_LOCKOUT": "CfgPeakLockout",
+    "BASAL_FACTOR": "CfgBasalFactor",
+    "LOW_SUSPEND": "CfgLowSuspend",
+    "BOLUS_LOCKOUT": "CfgBolusLockout",
+    "MAX_RISE": "CfgMaxRise",
 }
 """Which CFG_Param signal feeds which word of the control core's parameters."""
 
-UNSET_IS_ZERO = ("CfgMaxBasal", "CfgPramRatio")
-"""Limits and options that count as 0 when not flashed, never as unlimited (requirement LIM-04)."""
+UNSET = {
+    "CfgMaxBasal": 0,
+    "CfgMaxBolus": 0,
+    "CfgMaxIob": 0,
+    "CfgPramRatio": 0,
+    "CfgPramBolus": 0,
+    "CfgInsulinTdd": 0,
+    "CfgPramTdd": 0,
+    "CfgBasalFactor": 0,
+    "CfgLowSuspend": 700,
+    "CfgBolusLockout": 3,
+    "CfgMaxRise": 2000,
+    "CfgStaleCgmLimit": 15,
+    "CfgStuckSamples": 10,
+}
+"""Raw values of limits and options that were not flashed: the tight ones, never unlimited (requirement LIM-04)."""
 
-LOWEST = {"CfgBasal": 1, "CfgGlucoseTarget": 600, "CfgMealGain": 10000, "CfgInsulinGain": 10000}
+LOWEST = {
+    "CfgBasal": 1,
+    "CfgGlucoseTarget": 600,
+    "CfgMealGain": 10000,
+    "CfgInsulinGain": 10000,
+    "CfgCarbRatio": 100,
+}
 """Raw values below which a parameter is refused as implausible (project's choice)."""
 
 
@@ -72,6 +113,27 @@ class Calibration:
         """Whether a complete, checked set is in force."""
         return bool(self._active)
 
+    def value(self, name: str) -> int:
+        """Raw value of a parameter of `UNSET` in force, e.g. a limit that the control core does not know."""
+        return self._active.get(name, UNSET[name])
+
+    def save(self) -> list[int]:
+        """The set in force for the non-volatile memory: index and value in turn, their number first."""
+        index = {name: number for number, name in self._names.items()}
+        words = [len(self._active)]
+        for name, raw in self._active.items():
+            words += [index[name], raw]
+        return words
+
+    def restore(self, words: Iterator[int]) -> None:
+        """Take back what `save` wrote; a set that is not complete is not in force."""
+        self._received = {}
+        for _ in range(next(words)):
+            index = next(words)
+            self._received[index] = next(words)
+        if self._received:
+            self._activate()
+
     def store(self, values: dict[str, int]) -> dict[str, int]:
         """Take one decoded CFG_Param and return the raw values of its CFG_ParamEcho.
 
@@ -101,9 +163,9 @@ class Calibration:
         parameters = []
         for word in layout.PARAMETERS:
             name = CORE[word.name]
-            if name not in values and name not in UNSET_IS_ZERO:
+            if name not in values and name not in UNSET:
                 return
-            parameters.append(values.get(name, 0))
+            parameters.append(values.get(name, UNSET.get(name, 0)))
         self.parameters = parameters
         self._active = values
         self._active_crc = set_crc(self._received)

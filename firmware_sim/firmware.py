@@ -1,35 +1,42 @@
 """The firmware as a node on the bus: frames in, one pass of its tasks per step, frames out.
 
 It speaks only in its turn (see `can_bus.lockstep`). Between two tokens it only remembers what arrived; the token runs
-the tasks in a fixed order: calibration and user input, sensor, pump, ladder, control law, commands, alarms, status.
+the tasks in a fixed order: calibration and user input, sensor, pump, ladder, control law, commands, boluses, alarms,
+status. A bolus needs the pump's answers, so a step with one takes several turns.
+
+With a non-volatile memory it survives a reset at any instant: what it must not forget is stored before any frame that
+depends on it leaves.
 """
 
-from collections.abc import Callable, Sequence
+import enum
+from collections.abc import Callable, Iterator, Sequence
 
 import dbc
 from can_bus.codec import Check, Receiver, Transmitter
 from can_bus.frame import Frame
-from can_bus.lockstep import Done, Phase, Turn
+from can_bus.lockstep import STEP_SECONDS, Done, Phase, Turn
 
 from .alarms import Alarms, Code
+from .bolus import Boluses, Drug
 from .calibration import Calibration
 from .cgm import Cgm
 from .control import layout
-from .control.core import (
-    MODE_NMA,
-    MODE_OFF,
-    MODE_OPEN_LOOP,
-    MODE_S2,
-    control_step,
-)
-from .control.fixed import Ints
+from .control.core import control_step
+from .control.fixed import Ints, round_divide
+from .control.layout import MODE_OFF, MODE_S4
+from .day import Day
 from .ladder import AGE_DEGRADED, Ladder, State
+from .meals import Meals
+from .nvm import Memory, Nvm
 from .pump import Op, Pump
 
-VERSION = (0, 1)
+VERSION = (0, 2)
 
-SUPPORTED_MODES = (MODE_OFF, MODE_OPEN_LOOP, MODE_NMA, MODE_S2)
-"""Modes this build accepts from MODE_Cmd; the rest are refused with DoseRejected."""
+SUPPORTED_MODES = tuple(range(MODE_OFF, MODE_S4 + 1))
+"""Modes this build accepts from MODE_Cmd; any other is refused with DoseRejected."""
+
+NVM_WORDS = 320
+"""Room for everything that survives a reset."""
 
 COMMANDING = (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN)
 """States in which the control law commands rates; in the others its limits cut nothing."""
@@ -43,8 +50,37 @@ REQUEST_SUSPEND, REQUEST_RESUME = 1, 2
 
 STEP_SNA = 1048575
 
+IOB_MAX = 4090
+
 MODE_SEQUENCES = 255
 """ModeCmdSeq runs from 0 to 254; 255 is SNA."""
+
+SIM_TIME_SNA = 268435455
+CLOCK_TOLERANCE = 60
+"""Seconds that SimTime may be off the step it names (requirement TIM-03)."""
+
+CLOCK_CAUTION = 3
+"""Samples after a jump of the clock in which insulin stays at or below the schedule (project's choice)."""
+
+URGENT_LOW = 550
+"""0.1 mg/dL below which UrgentLow is raised, in every state (requirement ALM-03)."""
+
+RESETS_KEPT = 5
+RESETS_WITHIN = 12
+"""So many resets within so many steps hold SafeBasal until the user resumes (requirement RST-04)."""
+
+SKIPPED_AT_MOST = 288
+"""Steps that are caught up one by one after a gap; by then every filter has forgotten."""
+
+
+class Cause(enum.IntEnum):
+    """HB_CTRL.ResetCauseCtrl."""
+
+    POWER_ON = 0
+    BROWN_OUT = 1
+    WATCHDOG = 2
+    SOFTWARE = 3
+    PIN = 4
 
 
 def subscriptions() -> list[str]:
@@ -53,10 +89,17 @@ def subscriptions() -> list[str]:
 
 
 class Firmware:
-    """The dosing controller, without a bus: see `can_bus.lockstep.Node`."""
+    """The dosing controller, without a bus: see `can_bus.lockstep.Node`.
 
-    def __init__(self) -> None:
+    Args:
+        memory: non-volatile; what it holds of an earlier life is taken up, until a roll call begins a new run.
+        cause: why the device starts.
+    """
+
+    def __init__(self, memory: Memory | None = None, cause: Cause = Cause.POWER_ON) -> None:
         self.finished = False
+        self._nvm = None if memory is None else Nvm(memory, NVM_WORDS)
+        self._cause = cause
         self._handlers: dict[str, Callable[[dict[str, int]], None]] = {
             "CGM_Reading": self._on_cgm_reading,
             "PUMP_Status": self._on_pump_status,
@@ -65,8 +108,15 @@ class Firmware:
             "CFG_Param": self._on_cfg_param,
             "UI_AlarmAck": self._on_alarm_ack,
             "PLANT_Info": self._on_plant_info,
+            "PUMP_Ack": self._on_pump_ack,
+            "PUMP_BolusState": self._on_bolus_state,
+            "CGM_Status": self._on_cgm_status,
+            "MEAL_Announce": self._on_meal_announce,
         }
         self._boot()
+        record = None if self._nvm is None else self._nvm.load()
+        if record is not None:
+            self._restore(iter(record))
 
     def _boot(self) -> None:
         """Everything as after power-on."""
@@ -77,6 +127,10 @@ class Firmware:
         self._alarms = Alarms()
         self._cgm = Cgm()
         self._pump = Pump()
+        self._boluses = Boluses()
+        self._meals = Meals()
+        self._insulin_day = Day()
+        self._pram_day = Day()
         self._ladder = Ladder()
         self._state: Ints = [0] * len(layout.STATE)
         self._inputs: Ints = [0] * len(layout.INPUTS)
@@ -87,8 +141,16 @@ class Firmware:
         self._step: int | None = None
         self._samples: list[dict[str, int]] = []
         self._totals: dict[str, int] | None = None
-        self._status_heard = False
+        self._status: dict[str, int] | None = None
         self._rejected = False
+        self._turn_open = False  # the step waits for the pump's answers
+        self._refused_seen = 0
+        self._boots = 0
+        self._boot_steps: list[int] = []  # first steps after the last resets
+        self._reset_here = False  # this life began in the middle of a run
+        self._held = False  # too many resets
+        self._clock_caution = 0
+        self._urgent = False
         self._peer_version: tuple[int, int] | None = None
         self._toggle = 0
         self._crc_errors_seen = 0
@@ -100,6 +162,16 @@ class Firmware:
         self._last_implausible = -STEP_SNA
         self._last_limited = -STEP_SNA
         self._last_rejected = -STEP_SNA
+        self._last_reset = -STEP_SNA
+        self._last_jump = -STEP_SNA
+        self._last_change = -STEP_SNA
+
+    def start(self) -> list[Frame]:
+        """What the device says by itself after a reset in the middle of a run, to be sent before it listens."""
+        if not self._reset_here:
+            return []
+        self._send_heartbeat(NMT_BOOT_UP)
+        return self._turn.take()
 
     # ---- frames in
 
@@ -120,8 +192,21 @@ class Firmware:
     def _on_cgm_reading(self, values: dict[str, int]) -> None:
         self._samples.append(values)
 
-    def _on_pump_status(self, _values: dict[str, int]) -> None:
-        self._status_heard = True
+    def _on_pump_status(self, values: dict[str, int]) -> None:
+        self._status = values
+
+    def _on_pump_ack(self, values: dict[str, int]) -> None:
+        self._pump.hear_ack(values)
+        self._boluses.hear_ack(values)
+
+    def _on_bolus_state(self, values: dict[str, int]) -> None:
+        self._boluses.hear_state(values)
+
+    def _on_cgm_status(self, values: dict[str, int]) -> None:
+        self._cgm.status(values)
+
+    def _on_meal_announce(self, values: dict[str, int]) -> None:
+        self._meals.hear(values)
 
     def _on_pump_delivered(self, values: dict[str, int]) -> None:
         self._totals = values
@@ -147,8 +232,11 @@ class Firmware:
             self._rejected = True
         if values["SuspendRequest"] == REQUEST_SUSPEND:
             self._suspended = True
+            self._boluses.cancel()
         elif values["SuspendRequest"] == REQUEST_RESUME:
             self._suspended = False
+            self._held = False
+            self._boot_steps.clear()
 
     def _on_alarm_ack(self, values: dict[str, int]) -> None:
         if values["AlarmAckNode"] == 1 and values["AlarmAckAction"] in (1, 2):
@@ -162,10 +250,30 @@ class Firmware:
             return self._answer_roll_call(step)
         if phase == Phase.STEP and step != STEP_SNA:
             if self._step is None or step > self._step:
+                self._check_clock(step, values["SimTime"])
                 self._run_step(step)
+                return self._close(step)
+        elif phase == Phase.CONTINUE and self._turn_open and step == self._step:
+            self._boluses.listen()
+            return self._close(step)
         elif phase == Phase.END:
             self.finished = True
         return self._turn.close(step)
+
+    def _close(self, step: int) -> list[Frame]:
+        """End the turn: with a question to the pump as long as a bolus needs its answer, else with the reports."""
+        self._turn_open = self._boluses.speak(self._turn)
+        if not self._turn_open:
+            self._report_alarms(self._ladder.state, step)
+            self._report_status(self._ladder.state)
+        self._store()
+        return self._turn.close(step, Done.CONTINUE if self._turn_open else Done.OK)
+
+    def _check_clock(self, step: int, sim_time: int) -> None:
+        off = sim_time - step * STEP_SECONDS
+        if sim_time != SIM_TIME_SNA and not -CLOCK_TOLERANCE <= off <= CLOCK_TOLERANCE:
+            self._clock_caution = CLOCK_CAUTION
+            self._last_jump = step
 
     def _answer_roll_call(self, call: int) -> list[Frame]:
         peer = self._peer_version
@@ -186,22 +294,58 @@ class Firmware:
         return answer
 
     def _run_step(self, step: int) -> None:
+        skipped = 0 if self._step is None else step - self._step - 1
         self._step = step
+        if self._reset_here and self._last_reset < 0:
+            self._count_reset(step)
         glucose = self._judge_sensor(step)
-        delivered = self._hear_pump(step)
+        delivered, bolus = self._hear_pump(step)
         state = self._ladder.update(
             calibrated=self._calibration.active,
             suspended=self._suspended or self._mode == MODE_OFF,
             age=self._cgm.age(step),
             streak=self._cgm.streak,
             pump_age=self._pump.age(step),
+            uncertain=self._boluses.uncertain,
+            held=self._held,
+            age_degraded=self._stale_age(),
         )
-        self._control(state, glucose, delivered)
+        self._catch_up(skipped)
+        if delivered > 0:  # what the schedule gave in the steps that were caught up has been counted there
+            delivered = max(delivered - self._scheduled(skipped), 0)
+        self._control(state, glucose, delivered, bolus)
         self._command(state, step)
-        self._report_alarms(state, step)
-        self._report_status(state)
+        self._start_boluses(step)
+
+    def _stale_age(self) -> int:
+        """CfgStaleCgmLimit as the age of a sample, in steps; it can only tighten (requirement USR-05)."""
+        return min(self._calibration.value("CfgStaleCgmLimit") // 5 + 1, AGE_DEGRADED)
+
+    def _count_reset(self, step: int) -> None:
+        self._last_reset = step
+        self._boot_steps = [*self._boot_steps, step][-RESETS_KEPT:]
+        if len(self._boot_steps) == RESETS_KEPT and step - self._boot_steps[0] < RESETS_WITHIN:
+            self._held = True
+
+    def _scheduled(self, steps: int) -> int:
+        """Insulin (mU) of the schedule in some steps."""
+        return round_divide(self._calibration.parameters[layout.BASAL] * steps, 12)
+
+    def _catch_up(self, skipped: int) -> None:
+        """Let insulin on board and the filters age by steps that never came (requirement TIM-02)."""
+        if not self._calibration.active:
+            return
+        inputs = self._inputs
+        for _ in range(min(skipped, SKIPPED_AT_MOST)):
+            inputs[:] = [0] * len(inputs)
+            inputs[layout.IN_GLUCOSE] = -1
+            inputs[layout.IN_DELIVERED] = -1
+            inputs[layout.IN_MODE] = self._mode
+            inputs[layout.IN_LIMIT] = layout.LIMIT_SCHEDULE
+            control_step(self._state, self._calibration.parameters, inputs, self._outputs)
 
     def _judge_sensor(self, step: int) -> int:
+        self._cgm.stuck_limit = self._calibration.value("CfgStuckSamples")
         verdict = self._cgm.judge(self._samples, step)
         self._samples = []
         if verdict.glucose >= 0:
@@ -212,31 +356,77 @@ class Firmware:
         self._sequence_errors += verdict.repeated
         if verdict.refused or verdict.repeated:
             self._last_implausible = step
+        if verdict.glucose >= 0:
+            self._urgent = verdict.glucose < URGENT_LOW
+            self._clock_caution = max(self._clock_caution - 1, 0) if self._last_jump != step else self._clock_caution
         return verdict.glucose
 
-    def _hear_pump(self, step: int) -> int:
-        if self._status_heard:
-            self._pump.status(step)
+    def _hear_pump(self, step: int) -> tuple[int, int]:
+        """Insulin (mU) delivered since the last step, -1 when not known; and the part of it that was a bolus."""
+        if self._status is not None:
+            self._pump.status(self._status, step)
+        pramlintide = self._pump.pramlintide(self._totals)
         basal = self._calibration.parameters[layout.BASAL]
         delivered = self._pump.delivered(self._totals, step, basal)
-        self._status_heard = False
+        self._status = None
         self._totals = None
-        return delivered
+        self._insulin_day.add(max(delivered, 0), step)
+        self._pram_day.add(pramlintide, step)
+        bolus = sum(raw * 10 for drug, raw in self._boluses.open_step(step) if drug == Drug.INSULIN)
+        return delivered, bolus
 
-    def _control(self, state: State, glucose: int, delivered: int) -> None:
+    def _control(self, state: State, glucose: int, delivered: int, bolus: int) -> None:
         inputs = self._inputs
         inputs[layout.IN_GLUCOSE] = glucose
         inputs[layout.IN_DELIVERED] = delivered
+        inputs[layout.IN_BOLUS] = bolus
         inputs[layout.IN_MODE] = self._mode
         inputs[layout.IN_RESET] = 1 if self._cgm.settling else 0
+        cautious = self._cgm.doubtful or self._clock_caution > 0 or self._pump.insulin_blocked
         if state == State.SUSPENDED or self._cgm.below_range:
             inputs[layout.IN_LIMIT] = layout.LIMIT_SUSPEND
-        elif state == State.AUTO:
+        elif state == State.AUTO and not cautious:
             inputs[layout.IN_LIMIT] = layout.LIMIT_NONE
         else:
             inputs[layout.IN_LIMIT] = layout.LIMIT_SCHEDULE
+        inputs[layout.IN_OPEN] = self._boluses.remaining(Drug.INSULIN)
+        inputs[layout.IN_INSULIN_LEFT] = self._insulin_left()
+        inputs[layout.IN_PRAM_LEFT] = self._pram_left()
+        inputs[layout.IN_PRAM_STOP] = 1 if self._pump.pram_blocked or self._pump.insulin_blocked else 0
+        stop = 0 if self._may_bolus(Drug.INSULIN, state) else layout.STOP_INSULIN
+        inputs[layout.IN_BOLUS_STOP] = stop | (0 if self._may_bolus(Drug.PRAMLINTIDE, state) else layout.STOP_PRAM)
+        inputs[layout.IN_MEAL], inputs[layout.IN_CARBS] = self._meals.take()
         if self._calibration.active:
             control_step(self._state, self._calibration.parameters, inputs, self._outputs)
+        if self._outputs[layout.OUT_REFUSED] or self._meals.refused:
+            self._meals.refused = False
+            self._rejected = True
+
+    def _may_bolus(self, drug: Drug, state: State) -> bool:
+        return state == State.AUTO and self._pump.heard and self._boluses.ready(drug)
+
+    def _insulin_left(self) -> int:
+        """What twice the daily dose leaves within 24 h, in mU; a bolus under way counts (requirement LIM-06)."""
+        limit = self._calibration.value("CfgInsulinTdd") * 20
+        return max(limit - self._insulin_day.total - self._boluses.remaining(Drug.INSULIN) * 10, 0)
+
+    def _pram_left(self) -> int:
+        """0.1 ug that the limit of 24 h leaves."""
+        delivered = round_divide(self._pram_day.total, 10)
+        limit = self._calibration.value("CfgPramTdd")
+        return max(limit - delivered - self._boluses.remaining(Drug.PRAMLINTIDE), 0)
+
+    def _start_boluses(self, step: int) -> None:
+        """Start what the law decided on, within what the pump accepts."""
+        for drug, word in ((Drug.INSULIN, layout.OUT_BOLUS), (Drug.PRAMLINTIDE, layout.OUT_PRAM_BOLUS)):
+            wanted = self._outputs[word] if self._calibration.active else 0
+            if wanted == 0:
+                continue
+            dose = min(wanted, self._boluses.limit[drug])
+            if dose < wanted:
+                self._outputs[layout.OUT_LIMITERS] |= layout.LIMITER_MAX_BOLUS
+            if dose > 0:
+                self._boluses.start(drug, dose, step)
 
     def _command(self, state: State, step: int) -> None:
         if state == State.DELIVERY_UNCERTAIN and self._ladder.rung == State.SAFE_BASAL:
@@ -258,9 +448,12 @@ class Firmware:
         # a missing sample is told by LimiterBits, and by CgmLost when it matters
         if self._outputs[layout.OUT_LIMITERS] & ~layout.LIMITER_STALE_CGM and state == State.AUTO:
             self._last_limited = step
-        if self._rejected:
+        if self._rejected or self._boluses.refused > self._refused_seen:
+            self._refused_seen = self._boluses.refused
             self._last_rejected = step
             self._rejected = False
+        if (state == State.SUSPENDED) != (self._reported_state == State.SUSPENDED):
+            self._last_change = step
         down = self._ladder.rung != State.AUTO
         lost = age >= AGE_DEGRADED or (down and (alarms.active(Code.CGM_LOST) or state == self._ladder.rung))
         alarms.hold(Code.CGM_LOST, lost and self._calibration.active, min(age, 0xFFFF))
@@ -268,12 +461,19 @@ class Firmware:
         alarms.hold(Code.E2E_FAULT, step - self._last_e2e_error < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_REJECTED, step - self._last_rejected < ALARM_HOLD, step)
-        alarms.hold(Code.PUMP_LOST, state == State.DELIVERY_UNCERTAIN, step)
+        alarms.hold(Code.PUMP_LOST, state == State.DELIVERY_UNCERTAIN and not self._boluses.uncertain, step)
+        alarms.hold(Code.DELIVERY_UNCERTAIN, self._boluses.uncertain or self._pump.unlike, step)
+        alarms.hold(Code.URGENT_LOW, self._urgent, step)
+        alarms.hold(Code.CLOCK_JUMP, step - self._last_jump < ALARM_HOLD, step)
+        alarms.hold(Code.NODE_RESET, step - self._last_reset < ALARM_HOLD, self._boots)
+        alarms.hold(Code.SELF_TEST, self._nvm is not None and self._nvm.damaged, step)
+        alarms.hold(Code.STATE_CHANGE, step - self._last_change < ALARM_HOLD, state)
         if state != self._reported_state:
             # every change of state is told with its cause in the same step, also to a user who has confirmed it
             self._reported_state = state
             alarms.repeat(Code.CGM_LOST)
             alarms.repeat(Code.PUMP_LOST)
+            alarms.repeat(Code.DELIVERY_UNCERTAIN)
         alarms.report(self._turn)
 
     def _report_status(self, state: State) -> None:
@@ -282,24 +482,87 @@ class Firmware:
             "CTRL_Status",
             CtrlMode=self._mode,
             CtrlState=state,
-            InsulinOnBoard=self._outputs[layout.OUT_IOB],
+            InsulinOnBoard=min(self._outputs[layout.OUT_IOB] + self._boluses.remaining(Drug.INSULIN), IOB_MAX),
             LimiterBits=self._outputs[layout.OUT_LIMITERS] if state in COMMANDING else 0,
             **({} if used is None else {"LastCgmSeq": used}),
+            **({} if self._meals.last is None else {"LastMealId": self._meals.last}),
         )
         receiver = self._receiver
         self._turn.send(
             "CTRL_Diag",
             E2eErrorCount=min(receiver.crc_errors + receiver.malformed, 4095),
             LostFrameCount=min(self._lost_frames(), 4095),
-            SequenceErrorCount=min(receiver.sequence_errors + self._sequence_errors + self._pump.refused, 1023),
+            SequenceErrorCount=min(self._sequence_errors + receiver.sequence_errors + self._refused_by_number(), 1023),
             SaturationCount=min(self._state[layout.SATURATIONS], 1023),
-            NvmFallbackCount=0,
+            NvmFallbackCount=0 if self._nvm is None else min(self._nvm.fallbacks, 255),
         )
         self._send_heartbeat(NMT_OPERATIONAL if self._calibration.active else NMT_PRE_OPERATIONAL)
+
+    def _refused_by_number(self) -> int:
+        return self._pump.refused + self._meals.repeated
 
     def _lost_frames(self) -> int:
         return self._receiver.lost + self._lost_unseen
 
     def _send_heartbeat(self, nmt: int) -> None:
-        self._turn.send("HB_CTRL", NmtCtrl=nmt, ToggleCtrl=self._toggle, ResetCauseCtrl=0, BootCtrl=0)
+        self._turn.send(
+            "HB_CTRL",
+            NmtCtrl=nmt,
+            ToggleCtrl=self._toggle,
+            ResetCauseCtrl=self._cause if self._reset_here else Cause.POWER_ON,
+            BootCtrl=self._boots % 32,
+        )
         self._toggle ^= 1
+
+    # ---- non-volatile memory
+
+    def _store(self) -> None:
+        """Keep what must survive a reset; called before the frames of the turn leave."""
+        if self._nvm is not None:
+            self._nvm.store(self._save())
+
+    def _save(self) -> list[int]:
+        resets = self._boot_steps + [-1] * (RESETS_KEPT - len(self._boot_steps))
+        return [
+            -1 if self._step is None else self._step,
+            self._boots,
+            self._mode,
+            -1 if self._mode_sequence is None else self._mode_sequence,
+            int(self._suspended),
+            int(self._held),
+            *resets,
+            *self._meals.save(),
+            *self._boluses.save(),
+            *self._pump.save(),
+            *self._cgm.save(),
+            *self._alarms.save(),
+            *self._insulin_day.save(),
+            *self._pram_day.save(),
+            *self._calibration.save(),
+            *self._state,
+        ]
+
+    def _restore(self, words: Iterator[int]) -> None:
+        """Take up an earlier life: everything that `_save` wrote, and one boot more."""
+        step = next(words)
+        self._step = None if step < 0 else step
+        self._boots = next(words) + 1
+        self._mode = next(words)
+        sequence = next(words)
+        self._mode_sequence = None if sequence < 0 else sequence
+        self._suspended = next(words) == 1
+        self._held = next(words) == 1
+        self._boot_steps = [reset for reset in (next(words) for _ in range(RESETS_KEPT)) if reset >= 0]
+        for part in (
+            self._meals,
+            self._boluses,
+            self._pump,
+            self._cgm,
+            self._alarms,
+            self._insulin_day,
+            self._pram_day,
+            self._calibration,
+        ):
+            part.restore(words)
+        self._state[:] = [next(words) for _ in layout.STATE]
+        self._reset_here = True

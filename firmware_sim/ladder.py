@@ -42,7 +42,18 @@ class Ladder:
         """What the CGM alone allows: AUTO, DEGRADED or SAFE_BASAL, whatever stands above it."""
         return self._rung
 
-    def update(self, *, calibrated: bool, suspended: bool, age: int, streak: int, pump_age: int) -> State:
+    def update(
+        self,
+        *,
+        calibrated: bool,
+        suspended: bool,
+        age: int,
+        streak: int,
+        pump_age: int,
+        uncertain: bool = False,
+        held: bool = False,
+        age_degraded: int = AGE_DEGRADED,
+    ) -> State:
         """One step.
 
         Args:
@@ -51,14 +62,19 @@ class Ladder:
             age: steps since the newest usable CGM sample was taken.
             streak: steps in a row with a usable sample, this one included.
             pump_age: steps since the pump's status and totals were both heard.
+            uncertain: a bolus may or may not have been delivered.
+            held: nothing but the schedule until the user resumes (too many resets).
+            age_degraded: age from which on at most the schedule is given; can only be tightened.
         """
-        self._rung = self._next_rung(age, streak)
+        self._rung = State.SAFE_BASAL if held else self._next_rung(age, streak, min(age_degraded, AGE_DEGRADED))
         if not calibrated:
             self.state = State.INIT
         elif suspended:
             self.state = State.SUSPENDED
-        elif pump_age >= PUMP_SILENT:
+        elif pump_age >= PUMP_SILENT or uncertain:
             self.state = State.DELIVERY_UNCERTAIN
+        elif held:
+            self.state = State.SAFE_BASAL
         elif self.state == State.INIT and streak < SAMPLES_UP and age < AGE_SAFE_BASAL:
             self.state = State.INIT
         elif self.state == State.INIT and streak >= SAMPLES_UP:
@@ -68,10 +84,10 @@ class Ladder:
             self.state = self._rung
         return self.state
 
-    def _next_rung(self, age: int, streak: int) -> State:
+    def _next_rung(self, age: int, streak: int, age_degraded: int) -> State:
         if age >= AGE_SAFE_BASAL:
             return State.SAFE_BASAL
-        floor = State.DEGRADED if age >= AGE_DEGRADED else State.AUTO
+        floor = State.DEGRADED if age >= age_degraded else State.AUTO
         if floor >= self._rung:
             return floor
         if streak >= SAMPLES_UP:

@@ -1,6 +1,7 @@
 """The pump as the firmware sees it: set-points with sequence number and expiry, and the totals it reports."""
 
 import enum
+from collections.abc import Iterator
 
 from can_bus.lockstep import Turn
 
@@ -19,6 +20,18 @@ BOOT_COUNT_SNA = 15
 
 NEVER = 1 << 20
 
+UNLIKE_STEPS = 2
+"""Steps in which the pump may show another set-point than the last one before it is an alarm (requirement CMD-09)."""
+
+ACK_INSULIN_RATE, ACK_PRAM_RATE = 1, 8
+"""PUMP_Ack.AckFor of the two answers to a set-point."""
+
+ACCEPTED, DUPLICATE, OVER_LIMIT = 0, 1, 3
+"""PUMP_Ack.AckResult."""
+
+STATE_STOPPED, STATE_FAULT = 5, 6
+OCCLUDED = 2
+
 
 class Op(enum.IntEnum):
     """PUMP_BasalCmd.BasalOp."""
@@ -34,6 +47,12 @@ class Pump:
     def __init__(self) -> None:
         self._sequence = SEQUENCES - 1
         self._confirmed_total: int | None = None  # mU, the newest total
+        self._pram_total: int | None = None  # 0.01 ug, the newest total
+        self._unlike = 0  # steps in a row in which the pump showed another set-point than the last one
+        self.insulin_blocked = False  # its line or its motor does not deliver
+        self.pram_blocked = False
+        self.rate_limit = 8000  # raw, what the pump accepts as it last said
+        self.pram_rate_limit = 8000
         self._boot_count: int | None = None
         self._estimated = 0  # mU assumed and not yet covered by a total
         self._commanded_rate: int | None = None  # 0.005 U/h in force by our last command; None = schedule
@@ -45,9 +64,51 @@ class Pump:
         """Steps since both the status and the totals were last heard."""
         return step - min(self._status_step, self._totals_step)
 
-    def status(self, step: int) -> None:
+    @property
+    def heard(self) -> bool:
+        """Whether status and totals have been heard since boot (requirement RST-03)."""
+        return self._status_step > -NEVER and self._totals_step > -NEVER
+
+    @property
+    def unlike(self) -> bool:
+        """Whether the pump does not run the set-point it was sent last."""
+        return self._unlike >= UNLIKE_STEPS
+
+    def status(self, values: dict[str, int], step: int) -> None:
         """A PUMP_Status arrived for instant `step`."""
+        shown = values["PumpLastBasalSeq"]
+        self._unlike = self._unlike + 1 if shown not in (SEQUENCES, self._sequence) else 0
         self._status_step = step
+        stopped = values["PumpState"] in (STATE_STOPPED, STATE_FAULT)
+        self.insulin_blocked = stopped or values["InsulinOcclusion"] == OCCLUDED or values["InsulinReservoir"] == 0
+        self.pram_blocked = values["PramOcclusion"] == OCCLUDED or values["PramReservoir"] == 0
+
+    def hear_ack(self, values: dict[str, int]) -> None:
+        """A PUMP_Ack of the last set-point; the two drugs are judged apart (requirement TWO-05)."""
+        if values["AckId"] != self._sequence:
+            return
+        accepted = values["AckResult"] in (ACCEPTED, DUPLICATE)
+        if values["AckFor"] == ACK_INSULIN_RATE:
+            self.refused += not accepted
+            if values["AckResult"] == OVER_LIMIT:
+                self.rate_limit = values["AckLimitRaw"]
+        elif values["AckFor"] == ACK_PRAM_RATE:
+            self.refused += not accepted
+            if values["AckResult"] == OVER_LIMIT:
+                self.pram_rate_limit = values["AckLimitRaw"]
+
+    def pramlintide(self, totals: dict[str, int] | None) -> int:
+        """Pramlintide delivered since the last total, in 0.01 ug; to be called before `delivered`."""
+        if totals is None or totals["PramTotal"] >= TOTAL_MODULUS or totals["PumpBootCount"] >= BOOT_COUNT_SNA:
+            return 0
+        last, total = self._pram_total, totals["PramTotal"]
+        rebooted = totals["PumpBootCount"] != self._boot_count
+        if last is not None and total < last and not rebooted:
+            return 0  # a total never falls without a reset of the pump
+        self._pram_total = total
+        if last is None:
+            return 0
+        return total if rebooted else total - last
 
     def delivered(self, totals: dict[str, int] | None, step: int, basal: int) -> int:
         """Insulin delivered since the last step.
@@ -107,6 +168,8 @@ class Pump:
             rate: 0.005 U/h.
             pramlintide_rate: 0.1 ug/h.
         """
+        rate = min(rate, self.rate_limit)
+        pramlintide_rate = min(pramlintide_rate, self.pram_rate_limit)
         self._sequence = (self._sequence + 1) % SEQUENCES
         rates = {"InsulinRate": rate, "PramlintideRate": pramlintide_rate} if op == Op.SET_RATE else {}
         self._commanded_rate = rate if op == Op.SET_RATE else 0 if op == Op.SUSPEND else None
@@ -117,3 +180,20 @@ class Pump:
             BasalUntilStep=(step + RATE_EXPIRES_AFTER) % 128,
             **rates,
         )
+
+    def save(self) -> list[int]:
+        """Words for the non-volatile memory; -1 stands for what is not known."""
+        known = (self._confirmed_total, self._pram_total, self._boot_count)
+        rate = -1 if self._commanded_rate is None else self._commanded_rate
+        return [self._sequence, *(-1 if word is None else word for word in known), self._estimated, rate]
+
+    def restore(self, words: Iterator[int]) -> None:
+        """Take back what `save` wrote."""
+        self._sequence = next(words)
+        total, pram_total, boot_count = next(words), next(words), next(words)
+        self._confirmed_total = None if total < 0 else total
+        self._pram_total = None if pram_total < 0 else pram_total
+        self._boot_count = None if boot_count < 0 else boot_count
+        self._estimated = next(words)
+        rate = next(words)
+        self._commanded_rate = None if rate < 0 else rate

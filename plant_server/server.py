@@ -23,6 +23,7 @@ from .physiology import Patient, Variability
 from .pump import REPORT, Pump, PumpSettings
 from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
 from .sensor import Sensor, SensorSettings
+from .user import User
 
 PMOL_PER_L_PER_MU_PER_L = 6.0
 """The model's conversion of plasma insulin: 1 mU/L = 6 pmol/L (Dalla Man et al. 2007)."""
@@ -94,6 +95,7 @@ class PlantServer:
         self._patient = _Body(run)
         self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name)
         self._pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
+        self._user = User(run.scenario, run.mode, run.seed, run.patient.name)
         self._outbox: list[Frame] = []
         self._echoes: dict[int, int] = {}
         self._info: dict[str, int] | None = None
@@ -128,10 +130,15 @@ class PlantServer:
             return ()
         if name == "PUMP_BasalCmd":
             self._outbox += self._pump.command(values, self.step, self._transmitter)
+        elif name == "PUMP_BolusCmd":
+            self._outbox += self._pump.bolus(values, self.step, self._transmitter)
+        elif name == "HB_CTRL":
+            return self._hear_heartbeat(values)
         elif name == "SYNC_Done":
             return self._on_done(values)
         elif name == "CTRL_Status":
             self._mode_seen = values["CtrlMode"]
+            self._user.hear(values["LastMealId"])
         elif name == "CTRL_Alarm":
             self._confirm(values)
         elif name == "CFG_ParamEcho":
@@ -139,6 +146,15 @@ class PlantServer:
         elif name == "CTRL_Info":
             self._info = values
         return ()
+
+    def _hear_heartbeat(self, values: dict[str, int]) -> list[Frame]:
+        """A device that starts anew in the middle of a run begins its E2E counters at 0, and has lost its turn."""
+        if values["NmtCtrl"] != NMT_BOOT_UP or self._phase != Phase.STEP:
+            return []
+        self._receiver.reset()
+        self._turns = 0
+        time = self.step * STEP_SECONDS
+        return [self._transmitter.frame("SYNC_Step", SyncPhase=self._phase, StepIndex=self.step, SimTime=time)]
 
     def _on_done(self, values: dict[str, int]) -> list[Frame]:
         expected = self._call if self._phase == Phase.INIT else self.step
@@ -220,6 +236,8 @@ class PlantServer:
         self._outbox = []
         frames += self._confirm_pump_alarms()
         frames += self._fail_on_purpose()
+        if not last:
+            frames += self._user.announce(self.step, self._patient.rescued, self._transmitter)
         frames += self._pump.report_alarms(self._transmitter)
         reading = self._read_sensor()
         frames += self._sensor_status()
@@ -350,6 +368,7 @@ class _Body:
         for meal in run.scenario.meals:
             self._eat(meal, EATING_MINUTES)
         self._meal_index = 0
+        self.rescued: Meal | None = None  # sugar eaten at this instant
 
     def _eat(self, meal: Meal, minutes: int) -> None:
         """Put a meal on the table; it is eaten evenly over `minutes`."""
@@ -360,8 +379,9 @@ class _Body:
     def feel(self, step: int) -> None:
         """Eat sugar at this instant if glucose has been low for long enough."""
         carbs = self._rescuer.carbs(step, self.glucose) if self._rescuer else 0.0
+        self.rescued = None
         if carbs:
-            meal = Meal(step, RESCUE, carbs)
+            meal = self.rescued = Meal(step, RESCUE, carbs)
             self._meals.setdefault(step, []).append(meal)
             self._eat(meal, RESCUE_EATING_MINUTES)
 

@@ -10,7 +10,7 @@ from pumpbench.calibration import CalibrationError, Tuning, calibrate
 from can_bus import codec
 from can_bus.lockstep import Phase
 from firmware_sim.alarms import Code
-from firmware_sim.calibration import CORE, LOWEST, SET_CRC_INDEX, UNSET_IS_ZERO, parameter_names, set_crc
+from firmware_sim.calibration import CORE, LOWEST, SET_CRC_INDEX, UNSET, parameter_names, set_crc
 from firmware_sim.control import layout
 from firmware_sim.ladder import State
 from firmware_sim.pump import Op
@@ -19,7 +19,7 @@ from plant_server.physiology import load_patient
 NAMES = parameter_names()
 INDEX = {name: index for index, name in NAMES.items()}
 FIELDS = codec.message("CFG_Param").fields
-NEEDED = sorted(INDEX[name] for name in CORE.values() if name not in UNSET_IS_ZERO)
+NEEDED = sorted(INDEX[name] for name in CORE.values() if name not in UNSET)
 
 
 def echoes(bench: Bench, flash: dict[int, int]) -> dict[int, dict[str, int]]:
@@ -193,20 +193,27 @@ def test_an_index_without_a_parameter_is_answered_and_changes_nothing() -> None:
     assert bench.run(2).rate == rate
 
 
-@pytest.mark.parametrize("name", UNSET_IS_ZERO)
-def test_an_unset_limit_counts_as_zero(name: str) -> None:
+@pytest.mark.parametrize("name", UNSET)
+def test_an_unset_limit_counts_as_the_tight_one(name: str) -> None:
     flash = calibration()
     del flash[INDEX[name]]
     flash[SET_CRC_INDEX] = set_crc({index: raw for index, raw in flash.items() if index != SET_CRC_INDEX})
     bench = Bench(flash=flash, mode=S2)
-    turn = bench.run(4, 3000)
+    turn = bench.run(4, 2000)
     assert turn.state == State.AUTO
-    if name == "CfgMaxBasal":
-        assert turn.rate == bench.basal // 5
-        assert turn.status["LimiterBits"] & layout.LIMITER_MAX_BASAL
+    limits = {
+        "CfgMaxBasal": layout.LIMITER_MAX_BASAL,
+        "CfgBasalFactor": layout.LIMITER_MAX_BASAL,
+        "CfgMaxIob": layout.LIMITER_MAX_IOB,
+        "CfgInsulinTdd": layout.LIMITER_DAY,
+    }
+    if name in limits:
+        assert turn.rate <= bench.basal // 5
+        assert turn.status["LimiterBits"] & limits[name]
         assert turn.alarms(Code.DOSE_LIMITED)
     else:
         assert turn.rate > bench.basal // 5
+    if name in ("CfgPramRatio", "CfgPramTdd"):
         assert turn.command["PramlintideRate"] == 0
 
 

@@ -192,7 +192,7 @@ def test_a_signal_of_another_page_is_refused() -> None:
         message.pack({"CfgIndex": 0, "CfgCarbRatio": 5})
     with pytest.raises(CodecError, match=r"PUMP_BolusCmd\.InsulinBolus does not exist when BolusHormone is 15"):
         codec.message("PUMP_BolusCmd").pack({"BolusOp": 1, "BolusId": 1, "InsulinBolus": 100})  # which drug?
-    assert message.unpack(message.pack({"CfgIndex": 40}).to_bytes(8, "little")) == {"CfgIndex": 40}
+    assert message.unpack(message.pack({"CfgIndex": 60}).to_bytes(8, "little")) == {"CfgIndex": 60}
 
 
 def test_named_values() -> None:

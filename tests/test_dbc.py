@@ -400,7 +400,14 @@ def test_limiter_bits() -> None:
     comment = dbc.load().get_message_by_name("CTRL_Status").get_signal_by_name("LimiterBits").comment
     bits = {text: int(bit) for bit, text in re.findall(r"(\d) ([^,\d][^,]*)", comment.replace("bit0", "0"))}
     assert sorted(bits.values()) == list(range(8))
-    expected = {"MAX_BASAL": "max basal", "LOW_GLUCOSE": "low-glucose suspend", "STALE_CGM": "stale CGM"}
+    expected = {
+        "MAX_IOB": "max IOB",
+        "LOW_GLUCOSE": "low-glucose suspend",
+        "STALE_CGM": "stale CGM",
+        "LOCKOUT": "lockout time",
+        "DAY": "max per 24 h",
+        "RISE": "rate of change",
+    }
     limiters = {
         name.removeprefix("LIMITER_"): value for name, value in vars(layout).items() if name.startswith("LIMITER_")
     }

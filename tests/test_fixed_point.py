@@ -16,7 +16,19 @@ from pumpbench import compiled
 import firmware_sim.firmware
 from firmware_sim.calibration import CORE, parameter_names
 from firmware_sim.control import layout
-from firmware_sim.control.core import MODE_NMA, MODE_OFF, MODE_S2, RATE_MAX, control_step, limit_rate
+from firmware_sim.control.core import (
+    MODE_MA,
+    MODE_NMA,
+    MODE_OFF,
+    MODE_S1,
+    MODE_S2,
+    MODE_S3,
+    MODE_S4,
+    MODE_SMA,
+    RATE_MAX,
+    control_step,
+    limit_rate,
+)
 from firmware_sim.control.fixed import INT32_MAX, INT32_MIN, round_divide, round_shift, saturate
 from firmware_sim.control.layout import Word
 from firmware_sim.control.strategies import s2
@@ -125,6 +137,16 @@ def check_ranges(table: tuple[Word, ...], values: list[int]) -> None:
         assert word.low <= value <= word.high, (word.name, value)
 
 
+def inputs_of(**values: int) -> list[int]:
+    """The inputs of a step with nothing in the way: no daily limit near, no meal, schedule delivered."""
+    words = [0] * len(layout.INPUTS)
+    words[layout.IN_DELIVERED] = -1
+    words[layout.IN_INSULIN_LEFT] = words[layout.IN_PRAM_LEFT] = INT32_MAX
+    for name, value in values.items():
+        words[getattr(layout, name)] = value
+    return words
+
+
 def ends(table: tuple[Word, ...], *low: str) -> list[int]:
     """Every word at its upper end, those named at their lower one."""
     return [word.low if word.name in low else word.high for word in table]
@@ -144,11 +166,25 @@ def check_steps(state: list[int], parameters: list[int], inputs: list[list[int]]
         check_ranges(layout.OUTPUTS, o)
         assert s[layout.SATURATIONS] >= before
         assert o[layout.OUT_RATE] * 5 <= max(p[layout.MAX_BASAL], p[layout.BASAL])
+        assert o[layout.OUT_RATE] * 50 <= p[layout.BASAL] * max(p[layout.BASAL_FACTOR], 10)
+        assert o[layout.OUT_BOLUS] <= p[layout.MAX_BOLUS]
+        assert o[layout.OUT_PRAM_BOLUS] <= p[layout.PRAM_BOLUS]
+        assert o[layout.OUT_BOLUS] * 10 <= step[layout.IN_INSULIN_LEFT]
+        assert o[layout.OUT_PRAM_BOLUS] <= step[layout.IN_PRAM_LEFT]
+        assert o[layout.OUT_BOLUS] == 0 or o[layout.OUT_IOB] + o[layout.OUT_BOLUS] <= p[layout.MAX_IOB]
+        if step[layout.IN_LIMIT] != layout.LIMIT_NONE:
+            assert o[layout.OUT_BOLUS] == o[layout.OUT_PRAM_BOLUS] == 0
+        if step[layout.IN_PRAM_STOP]:
+            assert o[layout.OUT_PRAM_RATE] == o[layout.OUT_PRAM_BOLUS] == 0
+        if step[layout.IN_MODE] not in (MODE_MA, MODE_SMA, MODE_S3, MODE_S4):
+            assert o[layout.OUT_BOLUS] == 0
+        if step[layout.IN_MODE] not in (MODE_S1, MODE_S3, MODE_S4):
+            assert o[layout.OUT_PRAM_BOLUS] == 0
         if step[layout.IN_LIMIT] == layout.LIMIT_SCHEDULE:
             assert o[layout.OUT_RATE] * 5 <= p[layout.BASAL]
         if step[layout.IN_LIMIT] == layout.LIMIT_SUSPEND:
             assert o[layout.OUT_RATE] == o[layout.OUT_PRAM_RATE] == 0
-        if step[layout.IN_MODE] != MODE_S2:
+        if step[layout.IN_MODE] not in (MODE_S2, MODE_S4):
             assert o[layout.OUT_PRAM_RATE] == 0
 
 
@@ -186,7 +222,12 @@ def test_a_clamp_is_counted_where_it_happens() -> None:
     state, outputs = [0] * len(layout.STATE), [0] * len(layout.OUTPUTS)
     counts = []
     for k in range(60):
-        control_step(state, parameters, [3000, 100, MODE_NMA, 0, int(k == 0)], outputs)
+        control_step(
+            state,
+            parameters,
+            inputs_of(IN_GLUCOSE=3000, IN_DELIVERED=100, IN_MODE=MODE_NMA, IN_RESET=int(k == 0)),
+            outputs,
+        )
         counts.append(state[layout.SATURATIONS])
     assert counts[0] == 0 < counts[-1]
     assert counts == sorted(counts)
@@ -203,15 +244,15 @@ def core_parameters(patient: str, **raws: int) -> list[int]:
 
 
 def limited(
-    demand: int, carry: int = 0, limit: int = 0, basal: int = 1000, max_basal: int = 60000
+    demand: int, carry: int = 0, limit: int = 0, basal: int = 10000, max_basal: int = 60000
 ) -> tuple[int, int, int]:
-    """Rate, carry and limiter bits for a demand in 0.005 U/h, 16 fractional bits."""
+    """Rate, carry and limiter bits for a demand in 0.005 U/h, 16 fractional bits; no other limit is near."""
     state, parameters = [0] * len(layout.STATE), [0] * len(layout.PARAMETERS)
-    inputs, outputs = [0] * len(layout.INPUTS), [0] * len(layout.OUTPUTS)
+    inputs, outputs = inputs_of(IN_GLUCOSE=1200, IN_LIMIT=limit), [0] * len(layout.OUTPUTS)
     state[layout.RATE_CARRY] = carry
     parameters[layout.BASAL], parameters[layout.MAX_BASAL] = basal, max_basal
-    inputs[layout.IN_LIMIT] = limit
-    rate = limit_rate(demand, state, parameters, inputs, outputs)
+    parameters[layout.BASAL_FACTOR], parameters[layout.MAX_IOB], parameters[layout.MAX_RISE] = 255, 4000, 60000
+    rate = limit_rate(demand, 0, state, parameters, inputs, outputs)
     return rate, state[layout.RATE_CARRY], outputs[layout.OUT_LIMITERS]
 
 
@@ -323,13 +364,16 @@ def test_compiled_is_bit_identical_over_a_long_run(seed: int) -> None:
     for k in range(8000):
         glucose = min(max(glucose + draw.randint(-60, 60), 200), 8000)
         twin.step(
-            [
-                -1 if draw.random() < 0.05 else glucose,
-                draw.choice([-1, 0, 16777215, *[draw.randint(0, 400)] * 20]),
-                draw.choice([MODE_OFF, 1, 15, *[MODE_NMA, MODE_S2] * 10]),
-                draw.choice([1, 2, *[0] * 8]),
-                int(k < 2 or draw.random() < 0.01),
-            ]
+            inputs_of(
+                IN_GLUCOSE=-1 if draw.random() < 0.05 else glucose,
+                IN_DELIVERED=draw.choice([-1, 0, 16777215, *[draw.randint(0, 400)] * 20]),
+                IN_MODE=draw.choice([MODE_OFF, 1, 15, *range(MODE_NMA, MODE_S4 + 1), *[MODE_S1] * 3]),
+                IN_LIMIT=draw.choice([1, 2, *[0] * 8]),
+                IN_RESET=int(k < 2 or draw.random() < 0.01),
+                IN_BOLUS=draw.choice([0, 0, 0, draw.randint(0, 5000)]),
+                IN_MEAL=draw.choice([0, 0, 1, 2, 3]),
+                IN_CARBS=draw.randint(0, 1000),
+            )
         )
     assert twin.outputs[layout.OUT_RATE] >= 0
 
@@ -392,5 +436,5 @@ def test_the_compiled_core_can_be_called_from_compiled_code() -> None:
 
     words = [np.zeros(len(table), dtype=np.int64) for table in (layout.STATE, layout.INPUTS, layout.OUTPUTS)]
     parameters = np.array(core_parameters("adult#001"), dtype=np.int64)
-    words[1][:] = [1200, -1, MODE_NMA, 0, 0]
+    words[1][:] = inputs_of(IN_GLUCOSE=1200, IN_MODE=MODE_NMA)
     assert day(words[0], parameters, words[1], words[2]) == 288 * parameters[layout.BASAL] // 5

@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 import pytest
-from pumpbench.calibration import DATA, MODES, Tuning, calibrate, lags, lead
+from pumpbench.calibration import DATA, MODES, Tuning, calibrate, lags, lead, tuning_for
 from scipy import signal
 
 from can_bus import codec
 from can_bus.frame import Frame
-from firmware_sim.calibration import CORE, UNSET_IS_ZERO, parameter_names
+from can_bus.lockstep import Phase
+from firmware_sim.calibration import CORE, UNSET, parameter_names
 from firmware_sim.control import core, layout
 from firmware_sim.control.core import control_step
 from firmware_sim.firmware import Firmware
@@ -33,6 +34,8 @@ T = 5.0  # min
 DELAY = 3  # samples of e^(-15 s)
 INSULIN_LSB = 0.005  # U/h
 PRAMLINTIDE_LSB = 0.1  # ug/h
+INSULIN, PRAMLINTIDE = 1, 2  # BolusHormone
+BOLUS_LSB = {INSULIN: 0.01, PRAMLINTIDE: 0.1}  # U, ug
 STEPS_PER_DAY = 288
 
 ADULTS = tuple(f"adult#{number:03d}" for number in range(1, 11))
@@ -56,6 +59,8 @@ class Inputs:
     total: list[float] = field(default_factory=list)  # U delivered since the start
     limit: list[int] = field(default_factory=list)
     below_range: list[bool] = field(default_factory=list)  # suspends, whatever the ladder says
+    bolus: list[float] = field(default_factory=list)  # U of insulin boluses delivered since the start
+    meals: dict[int, float | None] = field(default_factory=dict)  # step -> g announced, None = the time alone
 
 
 class Oracle:
@@ -65,7 +70,9 @@ class Oracle:
         self.basal = patient.basal_u_per_h
         self.target = patient.basal_glucose
         self.max_basal = max(tuning.max_basal, self.basal)
-        self.ratio = tuning.pram_ratio if mode == MODES["s2"] else 0.0
+        self.mode, self.tuning = mode, tuning
+        self.carb_ratio = patient.carb_ratio_g_per_u
+        self.ratio = tuning.pram_ratio if mode in (MODES["s2"], MODES["s4"]) else 0.0
         meal_gain, insulin_gain = gains(patient.name)
         self.meal_gain = meal_gain
         self.gamma = tuning.gain * meal_gain / insulin_gain
@@ -79,8 +86,45 @@ class Oracle:
         self.observer = signal.bilinear(zeros, filtered, fs=1 / T)
 
     def demand(self, inputs: Inputs) -> Floats:
-        """u_b + gamma d of every step, U/h, before limits and rounding."""
-        return self.basal + 60 * self.gamma * self.meal(np.array(inputs.glucose), np.array(inputs.total))
+        """u_b + gamma d - x F e^(-15 s) u_B of every step, U/h, before limits and rounding."""
+        answer = self.gamma * self.meal(np.array(inputs.glucose), np.array(inputs.total))
+        return self.basal + 60 * (answer - self.tuning.bolus_deduction * self.filtered(np.array(inputs.bolus)))
+
+    def filtered(self, bolus: Floats) -> Floats:
+        """F(s) e^(-15 s) u_B of every step, U/min, from the bolus insulin delivered since the start."""
+        given = np.zeros(bolus.size)
+        given[1:] = np.diff(bolus) / T
+        numerator, denominator, _ = signal.cont2discrete(([1.0], cascade(*[self.tuning.theta] * 3)), T, method="zoh")
+        delayed = np.concatenate([np.zeros(DELAY - 1), given])[: bolus.size]
+        return signal.lfilter(numerator.ravel(), denominator, delayed)
+
+    def boluses(self, demand: Floats, inputs: Inputs) -> dict[tuple[int, int], float]:
+        """What the mode gives: (step, drug) -> U or ug, before rounding."""
+        doses: dict[tuple[int, int], float] = {}
+        for step, grams in inputs.meals.items():
+            simple = self.mode in (MODES["sma"], MODES["s4"])
+            carbs = self.tuning.assumed_carbs if simple or grams is None else grams
+            insulin = self.tuning.meal_factor * carbs / self.carb_ratio
+            doses[step, INSULIN] = insulin
+            if self.mode == MODES["s3"]:
+                doses[step, PRAMLINTIDE] = self.tuning.pram_bolus
+            elif self.mode == MODES["s4"]:
+                doses[step, PRAMLINTIDE] = self.ratio * np.floor(insulin * 100 + 1e-9) / 100
+        if self.mode == MODES["s1"]:
+            doses |= {(step, PRAMLINTIDE): self.tuning.pram_bolus for step in self.peaks(demand, inputs)}
+        return doses
+
+    def peaks(self, demand: Floats, inputs: Inputs) -> list[int]:
+        """Steps in which B_1 and B_2 of strategy 1 hold."""
+        u, glucose = np.maximum(demand, 0), np.array(inputs.glucose)
+        found: list[int] = []
+        for k in range(2, u.size):
+            peak = u[k - 1] > u[k - 2] and u[k] < u[k - 1]
+            steep = (glucose[k] - glucose[k - 1]) / T > self.tuning.peak_slope + 1e-9
+            waited = not found or k - found[-1] > self.tuning.peak_lockout
+            if peak and steep and waited and u[k] > self.tuning.peak_ratio * self.basal:
+                found.append(k)
+        return found
 
     def meal(self, glucose: Floats, total: Floats) -> Floats:
         """The estimate d of every step, g/min."""
@@ -124,6 +168,11 @@ class Loop:
     insulin: list[int] = field(default_factory=list)
     pramlintide: list[int] = field(default_factory=list)
     operation: list[int] = field(default_factory=list)
+    boluses: dict[tuple[int, int], int] = field(default_factory=dict)  # (step, drug) -> raw dose committed
+    step: int = 0
+    delivered: dict[int, int] = field(default_factory=dict)  # BolusId -> raw
+    meal_ids: set[int] = field(default_factory=set)
+    announced: list[dict[str, int]] = field(default_factory=list)
     diag: dict[str, int] = field(default_factory=dict)
 
     def play(self, run: Run) -> "Loop":
@@ -142,6 +191,7 @@ class Loop:
         # the last instant only ends the run
         self.inputs.glucose.pop()
         self.inputs.total.pop()
+        self.inputs.bolus.pop()
         return self
 
     def _hear_plant(self, frame: Frame) -> None:
@@ -153,6 +203,22 @@ class Loop:
             self.inputs.below_range.append(values["CgmState"] == 4)
         elif message.name == "PUMP_Delivered":
             self.inputs.total.append(message.unpack(frame.data)["InsulinTotal"] * 0.001)
+        elif message.name == "PUMP_BolusState":
+            values = message.unpack(frame.data)
+            if values["BolusStateHormone"] == INSULIN:
+                self.delivered[values["BolusStateId"]] = values["BolusDeliveredRaw"]
+                self.inputs.bolus.append(sum(self.delivered.values()) * 0.01)
+        elif message.name == "MEAL_Announce":
+            self.announced.append(message.unpack(frame.data))
+        elif message.name == "SYNC_Step":
+            values = message.unpack(frame.data)
+            if values["SyncPhase"] == Phase.STEP:
+                self.step = values["StepIndex"]
+                for meal in self.announced:
+                    if meal["MealId"] not in self.meal_ids and self.step not in self.inputs.meals:
+                        self.meal_ids.add(meal["MealId"])
+                        self.inputs.meals[self.step] = None if meal["MealKind"] == 2 else meal["CarbsEst"] * 0.5
+                self.announced.clear()
 
     def _hear_firmware(self, frame: Frame, firmware: Firmware) -> None:
         message = codec.messages_by_id()[frame.can_id]
@@ -162,6 +228,12 @@ class Loop:
             self.pramlintide.append(values["PramlintideRate"])
             self.operation.append(values["BasalOp"])
             self.demand.append(firmware._outputs[layout.OUT_DEMAND] / 65536 * INSULIN_LSB)
+        elif message.name == "PUMP_BolusCmd":
+            values = message.unpack(frame.data)
+            if values["BolusOp"] == 2:
+                drug = values["BolusHormone"]
+                dose = values["InsulinBolus" if drug == INSULIN else "PramlintideBolus"]
+                self.boluses[self.step, drug] = dose
         elif message.name == "CTRL_Status":
             state = message.unpack(frame.data)["CtrlState"]
             limit = {State.AUTO: 0, State.SUSPENDED: 2}.get(State(state), 1)
@@ -179,6 +251,9 @@ class Errors:
     unequal: int  # steps with any difference
     demand: float  # LSB of the insulin command
     day: float  # share of a day's insulin
+    bolus: float  # LSB of the bolus command, of either drug
+    boluses: int  # given by either
+    odd: int  # boluses that only one of the two gave
 
 
 def compare(name: str, strategy: str, days: int, tuning: Tuning | None = None, wrong: Tuning | None = None) -> Errors:
@@ -191,13 +266,14 @@ def compare(name: str, strategy: str, days: int, tuning: Tuning | None = None, w
         tuning: of both.
         wrong: of the firmware, if that shall differ from the oracle's.
     """
-    patient, tuning = load_patient(name), tuning or Tuning()
+    patient, tuning = load_patient(name), tuning or tuning_for(strategy)
     mode = MODES[strategy]
     calibration = calibrate(patient, wrong or tuning)
     run = Run(patient, load_scenario("validation-14d"), days * STEPS_PER_DAY, 1, mode, calibration)
     loop = Loop().play(run)
     assert loop.diag["SaturationCount"] == loop.diag["LostFrameCount"] == loop.diag["E2eErrorCount"] == 0
     oracle = Oracle(patient, tuning, mode)
+    assert len(loop.meal_ids) < 255, "MealId has wrapped: the oracle cannot tell meals apart"
     demand = oracle.demand(loop.inputs)
     insulin, pramlintide = oracle.commands(demand, loop.inputs.limit)
     commanded = np.array(loop.operation) == Op.SET_RATE
@@ -205,17 +281,23 @@ def compare(name: str, strategy: str, days: int, tuning: Tuning | None = None, w
     difference = (np.array(loop.insulin) - insulin)[commanded]
     pram_difference = (np.array(loop.pramlintide) - pramlintide)[commanded]
     daily = np.where(commanded, [loop.insulin, insulin], 0).reshape(2, days, STEPS_PER_DAY).sum(axis=2)
+    expected = oracle.boluses(demand, loop.inputs)
+    both = expected.keys() & loop.boluses.keys()
+    bolus_errors = [expected[key] / BOLUS_LSB[key[1]] - loop.boluses[key] for key in both]
     return Errors(
         insulin=int(np.abs(difference).max()),
         pramlintide=int(np.abs(pram_difference).max()),
         unequal=int(np.count_nonzero(difference)),
         demand=float(np.abs(np.array(loop.demand) - demand).max() / INSULIN_LSB),
         day=float(np.abs(daily[0] / daily[1] - 1).max()),
+        bolus=float(max(np.abs(bolus_errors), default=0.0)),
+        boluses=len(both),
+        odd=len(expected.keys() ^ loop.boluses.keys()),
     )
 
 
 @pytest.mark.parametrize("name", ADULTS)
-@pytest.mark.parametrize("strategy", ["nma", "s2"])
+@pytest.mark.parametrize("strategy", MODES)
 def test_every_dose_is_within_one_lsb_of_the_float_oracle(name: str, strategy: str) -> None:
     errors = compare(name, strategy, days=14)
     print(f"{name} {strategy}: {errors}")
@@ -223,6 +305,9 @@ def test_every_dose_is_within_one_lsb_of_the_float_oracle(name: str, strategy: s
     assert errors.pramlintide <= 1
     assert errors.demand < 0.25  # the integers themselves; the rest of an LSB is the rounding of the command
     assert errors.day < 0.001
+    assert errors.bolus < 1 + 1e-9  # rounded down
+    assert errors.odd == 0
+    assert (errors.boluses > 14) == (strategy not in ("nma", "s2"))
 
 
 def test_a_limit_that_bites_is_kept_to_the_same_lsb() -> None:
@@ -246,7 +331,7 @@ def flashed(name: str, tuning: Tuning | None = None) -> list[int]:
     """The parameters of the control core after flashing this patient."""
     names = parameter_names()
     values = {names[index]: raw for index, raw in calibrate(load_patient(name), tuning).items()}
-    assert set(CORE.values()) <= set(values) | set(UNSET_IS_ZERO)
+    assert set(CORE.values()) <= set(values) | set(UNSET)
     return [values[CORE[word.name]] for word in layout.PARAMETERS]
 
 
@@ -258,6 +343,7 @@ def core_demand(parameters: list[int], glucose: Floats, delivered: Floats | None
         inputs[layout.IN_GLUCOSE] = round(glucose[k] * 10)
         inputs[layout.IN_DELIVERED] = -1 if delivered is None else round(delivered[k] * 1000)
         inputs[layout.IN_MODE] = core.MODE_NMA
+        inputs[layout.IN_INSULIN_LEFT] = 1 << 30
         inputs[layout.IN_RESET] = int(k < 2)
         control_step(state, parameters, inputs, outputs)
         demand[k] = outputs[layout.OUT_DEMAND] / 65536 * INSULIN_LSB

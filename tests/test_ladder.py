@@ -450,8 +450,8 @@ def test_other_causes_that_flap_raise_one_alarm_in_half_an_hour(period: int) -> 
     for script in (corrupt, implausible, late, silent, refused):
         at_most_one_in_half_an_hour(raised(high(), 80, script))
 
-    limited = Bench(flash=calibration(CfgMaxBasal=1600))
-    new = raised(limited, 80, lambda bench, k: bench.step(HIGH if k % period == 0 else GLUCOSE))
+    limited = Bench(flash=calibration(CfgMaxBasal=1430))
+    new = raised(limited, 80, lambda bench, k: bench.step(GLUCOSE + 450 if k % period == 0 else GLUCOSE))
     assert new[Code.DOSE_LIMITED]
     at_most_one_in_half_an_hour(new)
 

@@ -1,4 +1,4 @@
-"""One control step, from a CGM sample and the pump's totals to the rates of both drugs.
+"""One control step, from a CGM sample and the pump's totals to the rates and boluses of both drugs.
 
 The core is pure arithmetic on arrays of integers: no frames, no clock, no exceptions. The same source runs as plain
 Python on lists in the firmware process and compiled by numba on int64 arrays in campaigns; a test compares the two bit
@@ -8,35 +8,45 @@ supervisor, and arrives here as IN_LIMIT.
 
 from .fixed import Ints, round_divide, round_shift, saturate
 from .layout import (
-    BASAL,
+    BOLUS_WAIT,
+    GLUCOSE,
+    GLUCOSE_1,
+    GLUCOSE_2,
     IN_GLUCOSE,
-    IN_LIMIT,
     IN_MODE,
+    IN_RESET,
     IOB_1,
     IOB_2,
-    LIMIT_SCHEDULE,
-    LIMIT_SUSPEND,
-    LIMITER_LOW_GLUCOSE,
-    LIMITER_MAX_BASAL,
-    LIMITER_STALE_CGM,
-    MAX_BASAL,
+    MODE_MA,
+    MODE_NMA,
+    MODE_OFF,
+    MODE_OPEN_LOOP,
+    MODE_S1,
+    MODE_S2,
+    MODE_S3,
+    MODE_S4,
+    MODE_SMA,
+    OUT_BOLUS,
     OUT_DEMAND,
     OUT_IOB,
     OUT_LIMITERS,
+    OUT_PRAM_BOLUS,
     OUT_PRAM_RATE,
     OUT_RATE,
-    RATE,
-    RATE_CARRY,
+    OUT_REFUSED,
+    PRAM_WAIT,
     SATURATIONS,
+    TREND,
 )  # fmt: skip
+from .limits import RATE_MAX, limit_bolus, limit_pram_bolus, limit_pram_rate, limit_rate, schedule
 from .observer import above_schedule, meal_insulin
-from .strategies import s2
+from .prandial import announced_carbs, bolus, deduction
+from .strategies import s1, s2, s3, s4
 
-MODE_OFF, MODE_OPEN_LOOP, MODE_NMA, MODE_MA, MODE_SMA, MODE_S1, MODE_S2, MODE_S3, MODE_S4 = range(9)
-"""Codes of CtrlMode in the DBC."""
-
-RATE_MAX = 8000
-"""Largest raw rate of either drug on the wire; the codes above are reserved."""
+__all__ = [
+    "MODE_MA", "MODE_NMA", "MODE_OFF", "MODE_OPEN_LOOP", "MODE_S1", "MODE_S2", "MODE_S3", "MODE_S4", "MODE_SMA",
+    "RATE_MAX", "control_step", "insulin_on_board", "limit_rate",
+]  # fmt: skip
 
 IOB_MAX = 4090
 
@@ -57,39 +67,22 @@ def insulin_on_board(state: Ints, parameters: Ints, inputs: Ints) -> int:
     return min(max(round_divide(state[IOB_1] + state[IOB_2], 2560), 0), IOB_MAX)
 
 
-def limit_rate(demand: int, state: Ints, parameters: Ints, inputs: Ints, outputs: Ints) -> int:
-    """The rate to command for a demand: within the limits, rounded down, the rest carried to the next step.
+def follow_trend(state: Ints, inputs: Ints) -> None:
+    """Shift the last samples, before the observer takes the new one; a missing sample or a new start ends the row."""
+    if inputs[IN_GLUCOSE] < 0 or inputs[IN_RESET] == 1:
+        state[TREND] = 0
+    if inputs[IN_GLUCOSE] >= 0:
+        state[GLUCOSE_2] = state[GLUCOSE_1]
+        state[GLUCOSE_1] = state[GLUCOSE]
+        state[TREND] = min(state[TREND] + 1, 3)
 
-    Args:
-        demand: insulin rate in 0.005 U/h, 16 fractional bits.
-        state, parameters, inputs, outputs: as in `layout`; sets OUT_LIMITERS, advances RATE_CARRY.
 
-    Returns:
-        Rate in 0.005 U/h, between 0 and the smallest limit in force.
-    """
-    schedule = round_divide(parameters[BASAL] << 16, 5)
-    ceiling = min(max(round_divide(parameters[MAX_BASAL] << 16, 5), schedule), RATE_MAX << 16)
-    bits = 0
-    if demand > ceiling:
-        bits |= LIMITER_MAX_BASAL
-    if inputs[IN_LIMIT] == LIMIT_SCHEDULE:
-        ceiling = min(ceiling, schedule)
-        if demand > ceiling:
-            bits |= LIMITER_STALE_CGM
-    elif inputs[IN_LIMIT] == LIMIT_SUSPEND:
-        ceiling = 0
-        if demand > 0:
-            bits |= LIMITER_LOW_GLUCOSE
-    if inputs[IN_GLUCOSE] < 0:
-        # without a new sample the held one looks like the end of a fall: insulin may go down but never up
-        ceiling = min(ceiling, state[RATE] << 16)
-        if demand > ceiling:
-            bits |= LIMITER_STALE_CGM
-    outputs[OUT_LIMITERS] = bits
-    total = min(max(demand, 0), ceiling) + state[RATE_CARRY]
-    state[RATE_CARRY] = total & 65535
-    state[RATE] = min(total >> 16, ceiling >> 16)
-    return state[RATE]
+def wait(state: Ints) -> None:
+    """One step less to wait for the next bolus."""
+    if state[BOLUS_WAIT] > 0:
+        state[BOLUS_WAIT] -= 1
+    if state[PRAM_WAIT] > 0:
+        state[PRAM_WAIT] -= 1
 
 
 def control_step(state: Ints, parameters: Ints, inputs: Ints, outputs: Ints) -> None:
@@ -99,18 +92,41 @@ def control_step(state: Ints, parameters: Ints, inputs: Ints, outputs: Ints) -> 
         state, parameters, inputs, outputs: arrays of integers laid out as in `layout` (lists in plain Python, int64
             arrays when compiled); state and outputs are written.
     """
-    outputs[OUT_IOB] = insulin_on_board(state, parameters, inputs)
-    meal = meal_insulin(state, parameters, inputs)
     mode = inputs[IN_MODE]
-    demand = round_divide(parameters[BASAL] << 16, 5)
+    outputs[OUT_LIMITERS] = 0
+    outputs[OUT_IOB] = insulin_on_board(state, parameters, inputs)
+    wait(state)
+    follow_trend(state, inputs)
+    meal = meal_insulin(state, parameters, inputs)
+    taken = deduction(state, parameters, inputs)
+    demand = schedule(parameters)
     if mode == MODE_OFF:
         demand = 0
     elif mode != MODE_OPEN_LOOP:
         counts = state[SATURATIONS : SATURATIONS + 1]
-        demand = saturate(demand + meal, counts)
+        demand = saturate(demand + meal - taken, counts)
         state[SATURATIONS] = counts[0]
     outputs[OUT_DEMAND] = demand
-    outputs[OUT_RATE] = limit_rate(demand, state, parameters, inputs, outputs)
+    peak = s1.peak(max(demand, 0), state, parameters)
+
+    dose = 0
+    carbs = announced_carbs(parameters, inputs)
+    if carbs > 0:
+        dose = limit_bolus(bolus(carbs, parameters), state, parameters, inputs, outputs)
+    outputs[OUT_BOLUS] = dose
+    outputs[OUT_REFUSED] = 1 if carbs > 0 and dose == 0 else 0
+
+    wanted = 0
+    if mode == MODE_S1 and peak:
+        wanted = s1.dose(state, parameters)
+    elif mode == MODE_S3 and dose > 0:
+        wanted = s3.dose(parameters)
+    elif mode == MODE_S4 and dose > 0:
+        wanted = s4.dose(dose, parameters)
+    outputs[OUT_PRAM_BOLUS] = limit_pram_bolus(wanted, state, parameters, inputs, outputs)
+
+    outputs[OUT_RATE] = limit_rate(demand, dose, state, parameters, inputs, outputs)
     outputs[OUT_PRAM_RATE] = 0
-    if mode == MODE_S2 and inputs[IN_LIMIT] != LIMIT_SUSPEND:
-        outputs[OUT_PRAM_RATE] = min(s2.infusion(outputs[OUT_RATE], state, parameters), RATE_MAX)
+    if mode in (MODE_S2, MODE_S4):
+        infusion = s2.infusion(outputs[OUT_RATE], state, parameters)
+        outputs[OUT_PRAM_RATE] = limit_pram_rate(infusion, outputs[OUT_PRAM_BOLUS], inputs, outputs)

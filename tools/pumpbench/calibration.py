@@ -46,6 +46,30 @@ class Tuning:
     max_basal: float = 30.0  # U/h; a study must not touch it, metrics.json counts
     max_bolus: float = 30.0  # U
     max_iob: float = 40.0  # U
+    peak_ratio: float = 2.0  # z_1 of strategy 1
+    peak_slope: float = 0.5  # mg/dL/min, z_2
+    peak_lockout: int = 12  # steps, z_3
+    # limits that would change the paper's results are loose here; `SAFE` has the tight ones
+    basal_factor: float = 25.5  # times the schedule
+    low_suspend: float = 0.0  # mg/dL; 0 = off
+    bolus_lockout: int = 0  # steps
+    max_rise: float = 60.0  # U/h in a step
+    pram_tdd: float = 1000.0  # ug in 24 h
+    stuck_samples: int = 0  # equal values in a row; 0 = off
+
+
+def tuning_for(strategy: str, *, noisy: bool = True) -> Tuning:
+    """The tuning of one of the paper's modes: doses as in its Table 2.
+
+    Args:
+        strategy: name as in `MODES`.
+        noisy: whether the sensor has noise, so that equal values in a row mean that it is stuck.
+    """
+    return Tuning(pram_bolus=15.0 if strategy == "s3" else 30.0, stuck_samples=10 if noisy else 0)
+
+
+SAFE = Tuning(basal_factor=4.0, low_suspend=70.0, bolus_lockout=3, max_rise=2.0, stuck_samples=10)
+"""The limits of docs/design.md as a product would set them; the paper's runs would touch them."""
 
 
 @functools.cache
@@ -107,6 +131,15 @@ def calibrate(patient: Patient, tuning: Tuning | None = None) -> dict[int, int]:
         "CfgBolusDeduction": tuning.bolus_deduction,
         "CfgMealFactor": tuning.meal_factor,
         "CfgAssumedCarbs": tuning.assumed_carbs,
+        "CfgPeakRatio": tuning.peak_ratio,
+        "CfgPeakSlope": tuning.peak_slope,
+        "CfgPeakLockout": tuning.peak_lockout,
+        "CfgBasalFactor": tuning.basal_factor,
+        "CfgLowSuspend": tuning.low_suspend,
+        "CfgBolusLockout": tuning.bolus_lockout,
+        "CfgMaxRise": tuning.max_rise,
+        "CfgPramTdd": tuning.pram_tdd,
+        "CfgStuckSamples": tuning.stuck_samples,
         **_coefficients(tuning),
     }
     raws = {index: _raw(name, physical[name]) for index, name in _indices().items() if name in physical}

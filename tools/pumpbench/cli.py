@@ -33,10 +33,15 @@ VARIABILITY = "What varies in the patient: all, none, or a comma list of k_abs, 
 
 
 class Strategy(StrEnum):
-    """The modes of the paper this build knows."""
+    """The paper's seven modes."""
 
     NMA = "nma"
+    SMA = "sma"
+    MA = "ma"
+    S1 = "s1"
     S2 = "s2"
+    S3 = "s3"
+    S4 = "s4"
 
 
 class Failed(Exception):

@@ -5,6 +5,7 @@ the firmware decides. A hazard this build of the bench cannot yet observe is rep
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from can_bus.codec import Check, Receiver
@@ -14,7 +15,7 @@ from plant_server import mechanism
 
 WATCHED = (
     "SYNC_Step", "SYNC_Done", "CGM_Reading", "PUMP_BasalCmd", "PUMP_Delivered", "CTRL_Status", "CTRL_Alarm",
-    "CTRL_Diag", "CFG_Param", "PLANT_Truth", "FAULT_Inject",
+    "CTRL_Diag", "CFG_Param", "PLANT_Truth", "FAULT_Inject", "PUMP_BolusCmd", "PUMP_Ack", "PUMP_BolusState", "HB_CTRL",
 )  # fmt: skip
 
 USABLE_STATES = (1, 4, 5)
@@ -25,16 +26,141 @@ AGE_SCHEDULE = 7
 """Steps: from this age on nothing but the schedule, and no pramlintide (H4)."""
 
 SET_RATE, SUSPEND, RESUME_SCHEDULE = 1, 2, 3
-STATE_SUSPENDED = 4
-"""CTRL_Status.CtrlState: the user has suspended."""
+STATE_SUSPENDED, STATE_UNCERTAIN = 4, 6
+"""CTRL_Status.CtrlState: the user has suspended; a bolus may or may not have been given."""
+
+NMT_BOOT_UP = 0
+BOOT_COUNT_SNA = 15
 
 CGM_LOST = 1
 CFG_BASAL, CFG_MAX_BASAL = 0, 3
+CFG_BOLUS = {4: ("CfgMaxBolus", 1), 7: ("CfgPramBolus", 2)}
+"""CfgIndex -> name and drug of the limits of one bolus, in the raw coding of PUMP_BolusCmd."""
+
+BOLUS_DOSE = {1: "InsulinBolus", 2: "PramlintideBolus"}
+"""PUMP_BolusCmd.BolusHormone."""
+
+PROGRAM, COMMIT = 1, 2
+"""PUMP_BolusCmd.BolusOp."""
+
+COMMIT_ACKS = {3: 1, 5: 2}
+"""PUMP_Ack.AckFor of a Commit -> drug."""
+
+ACCEPTED = 0
+DELIVERING, DONE, ABORTED = 2, 3, 4
+"""PUMP_BolusState.BolusPhase."""
+
+BOLUS_RESERVED = 4000
+"""Raw doses above this are reserved codes."""
 ALARM_INACTIVE = 0
 INSULIN_LEDGER, PRAM_LEDGER = 4, 5
 NEVER = 1 << 20
 GRACE = 1
 """Steps a device may take to raise an alarm (requirement ALM-03)."""
+
+
+@dataclass
+class _Bolus:
+    """One BolusId of one drug, as the bus has shown it so far."""
+
+    until: int | None = None  # last step in which the pump may execute it; None: no command was seen
+    committed: bool = False  # a Commit was sent
+    accepted: bool = False  # and the pump has said that it took it
+    settled: bool = False  # whether it is given is known
+    phase: int = 0
+    delivered: int = 0
+    passed_by: bool = False  # the pump has shown another id after it
+    too_late: bool = False  # after its expiry the pump still had not begun it
+    counted_late: bool = False
+    counted_limit: bool = False
+
+
+class _BolusWatch:
+    """Boluses of both drugs: H1, H5, and the part of H2 that is about them."""
+
+    def __init__(self, hazards: dict[str, int]) -> None:
+        self._hazards = hazards
+        self.limits = {1: 0, 2: 0}
+        self._known: dict[tuple[int, int], _Bolus] = {}  # (drug, BolusId)
+        self._sent: dict[int, _Bolus] = {}  # the newest one of each drug that was commanded
+        self._shown: dict[int, int] = {}  # the id the pump showed last
+        self._uncertain = False  # the device said so at the end of the step before
+        self._resolved = False  # the pump has told in this step what became of a bolus
+
+    def command(self, values: dict[str, int], step: int) -> None:
+        """A PUMP_BolusCmd of instant `step`."""
+        drug, operation, number = values["BolusHormone"], values["BolusOp"], values["BolusId"]
+        if drug not in BOLUS_DOSE or operation not in (PROGRAM, COMMIT):
+            return
+        bolus = self._known.setdefault((drug, number), _Bolus())
+        if bolus.until is None:
+            bolus.until = step + (values["BolusUntilStep"] - step + 128) % 256 - 128
+            if operation == PROGRAM:
+                self._judge_new()
+            self._sent[drug] = bolus
+        bolus.committed |= operation == COMMIT
+        dose = values[BOLUS_DOSE[drug]]
+        if (dose > self.limits[drug] or dose > BOLUS_RESERVED) and not bolus.counted_limit:
+            bolus.counted_limit = True  # a retry is the same bolus
+            self._hazards["H2"] += 1
+
+    def _judge_new(self) -> None:
+        """A bolus begins: is everything before it known?"""
+        open_ = any(bolus.committed and not bolus.settled for bolus in self._sent.values())
+        self._hazards["H5"] += open_ or (self._uncertain and not self._resolved)
+
+    def ack(self, values: dict[str, int], step: int) -> None:
+        """A PUMP_Ack of what was sent in instant `step`."""
+        drug = COMMIT_ACKS.get(values["AckFor"])
+        if drug is None:
+            return
+        bolus = self._known.setdefault((drug, values["AckId"]), _Bolus())
+        bolus.settled = True
+        if values["AckResult"] != ACCEPTED:
+            return
+        if bolus.accepted:
+            self._hazards["H1"] += 1  # a second time: that is a second dose
+        bolus.accepted = True
+        begun_in_time = bolus.phase >= DELIVERING and not bolus.too_late  # then it is the answer that is late
+        if bolus.until is not None and step > bolus.until and not begun_in_time:
+            self._count_late(bolus)
+
+    def state(self, values: dict[str, int], step: int) -> None:
+        """A PUMP_BolusState at the opening of instant `step`."""
+        drug, number, phase = values["BolusStateHormone"], values["BolusStateId"], values["BolusPhase"]
+        if drug not in BOLUS_DOSE or phase > ABORTED:
+            return
+        delivered = values["BolusDeliveredRaw"]
+        if delivered > values["BolusProgrammedRaw"]:
+            self._hazards["H1"] += 1
+        sent = self._sent.get(drug)
+        bolus = self._known.setdefault((drug, number), _Bolus())
+        last = self._shown.get(drug)
+        if last is not None and last != number:
+            self._known[drug, last].passed_by = True
+        self._shown[drug] = number
+        again = bolus.passed_by or delivered < bolus.delivered or (phase < bolus.phase and bolus.phase >= DONE)
+        self._hazards["H1"] += again
+        if phase == DELIVERING or delivered:
+            if bolus.too_late:
+                self._count_late(bolus)
+        elif sent is not None and sent.until is not None and step > sent.until and sent.phase < DELIVERING:
+            sent.too_late = sent is not bolus or phase < DELIVERING
+        bolus.phase, bolus.delivered, bolus.passed_by = phase, delivered, False
+        if sent is not None and not sent.settled:
+            never = sent.until is not None and step > sent.until  # the pump must not begin it any more
+            if (sent is bolus and phase >= DELIVERING) or (sent is not bolus and never):
+                sent.settled = self._resolved = True
+
+    def _count_late(self, bolus: _Bolus) -> None:
+        if not bolus.counted_late:
+            bolus.counted_late = True
+            self._hazards["H1"] += 1
+
+    def close_step(self, *, uncertain: bool) -> None:
+        """The device is done with an instant, and says whether it knows what was given."""
+        self._uncertain = uncertain
+        self._resolved = False
 
 
 class Monitor:
@@ -45,7 +171,11 @@ class Monitor:
         self._start()
 
     def _start(self) -> None:
-        self.hazards = dict.fromkeys(("H2", "H3", "H4", "H6", "H7"), 0)
+        self.hazards = dict.fromkeys(("H1", "H2", "H3", "H4", "H5", "H6", "H7"), 0)
+        self._boluses = _BolusWatch(self.hazards)
+        self._step = -1  # of the newest token
+        self._boot_count: int | None = None
+        self._ledger_base: dict[str, int] = {"Insulin": 0, "Pram": 0}  # strokes delivered before the totals began
         self._taken: int | None = None
         self._sequences: set[int] = set()
         self._fresh: list[tuple[int, int]] = []  # (sequence, sample step mod 256) of this step's usable samples
@@ -72,6 +202,8 @@ class Monitor:
 
     def _on_sync_step(self, values: dict[str, int]) -> None:
         self._phase = values["SyncPhase"]
+        if self._phase in (Phase.STEP, Phase.CONTINUE):
+            self._step = values["StepIndex"]
 
     def _on_cgm_reading(self, values: dict[str, int]) -> None:
         state, glucose = values["CgmState"], values["GlucoseConc"]
@@ -83,9 +215,24 @@ class Monitor:
             self._basal = values["CfgBasal"]
         elif values["CfgIndex"] == CFG_MAX_BASAL:
             self._max_basal = values["CfgMaxBasal"]
+        elif values["CfgIndex"] in CFG_BOLUS:
+            name, drug = CFG_BOLUS[values["CfgIndex"]]
+            self._boluses.limits[drug] = values[name]
+
+    def _on_pump_ack(self, values: dict[str, int]) -> None:
+        self._boluses.ack(values, self._step)
+
+    def _on_pump_bolusstate(self, values: dict[str, int]) -> None:
+        self._boluses.state(values, self._step + 1)
 
     def _on_pump_delivered(self, values: dict[str, int]) -> None:
         self._totals = values
+        boot_count = values["PumpBootCount"]
+        if boot_count >= BOOT_COUNT_SNA:
+            return
+        if self._boot_count not in (None, boot_count):
+            self._ledger_base = {}  # the totals have begun anew, the ledger has not
+        self._boot_count = boot_count
 
     def _on_plant_truth(self, values: dict[str, int]) -> None:
         if self._totals is None:
@@ -99,13 +246,21 @@ class Monitor:
 
     def _check_ledger(self, values: dict[str, int], drug: str, total: int, stroke: int) -> None:
         open_strokes = values[f"Truth{drug}Pending"] + values[f"Truth{drug}Lost"]
-        if total % stroke or (values[f"Truth{drug}Commanded"] - open_strokes - total // stroke) % 16384:
+        before = (values[f"Truth{drug}Commanded"] - open_strokes - total // stroke) % 16384
+        if total % stroke or before != self._ledger_base.setdefault(drug, before):
             self.hazards["H6"] += 1
 
     def _on_fault_inject(self, _values: dict[str, int]) -> None:
         self.injected += 1
 
     # ---- what it did
+
+    def _on_hb_ctrl(self, values: dict[str, int]) -> None:
+        if values["NmtCtrl"] == NMT_BOOT_UP:
+            self._receiver.reset()  # a device that starts anew begins its counters at 0
+
+    def _on_pump_boluscmd(self, values: dict[str, int]) -> None:
+        self._boluses.command(values, self._step)
 
     def _on_pump_basalcmd(self, values: dict[str, int]) -> None:
         self._command = values
@@ -127,6 +282,7 @@ class Monitor:
             return  # the step goes on
         if self._phase in (Phase.STEP, Phase.CONTINUE):
             self._judge(values["DoneStepIndex"])
+            self._boluses.close_step(uncertain=self._state == STATE_UNCERTAIN)
         self._fresh = []
         self._command = None
         self._totals = None

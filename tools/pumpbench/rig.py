@@ -37,10 +37,11 @@ from can_bus.url import open_link
 from plant_server.physiology import SOURCES, cohort, load_patient
 from plant_server.scenario import load_scenario
 from plant_server.sensor import load_sensor
+from plant_server.sensors.ideal import Ideal
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
 from pumpbench import __version__
-from pumpbench.calibration import MODES, CalibrationError, calibrate
+from pumpbench.calibration import MODES, CalibrationError, calibrate, tuning_for
 from pumpbench.capture import Capture
 from pumpbench.faults import Faults, write_wire
 from pumpbench.faults import load as load_fault_file
@@ -141,8 +142,8 @@ def prepare(request: Request) -> Prepared:
             f"{request.patient}: there is no controller model for patients of your own files yet; "
             f"the closed loop knows {', '.join(cohort())}"
         )
-    calibration = calibrate(patient)
     sensor = load_sensor(request.sensor)
+    calibration = calibrate(patient, tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal)))
     mode = MODES[request.strategy]
     sensor = sensor.model_copy(update={"effects": (*sensor.effects, *faults.sensor)})
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, faults.pump)

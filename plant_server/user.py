@@ -1,0 +1,64 @@
+"""The user between the meals and the device: tells of each meal until the device has heard it."""
+
+from collections import deque
+
+from can_bus.codec import Transmitter
+from can_bus.frame import Frame
+
+from .scenario import POLICY_OF_MODE, Announcement, Meal, Scenario, announcements, rescue_announcement
+from .scenarios.announcing import OFFSET_MAX
+
+IDS = 255
+"""MealId runs from 0 to 254; 255 is SNA."""
+
+PATIENCE = 12
+"""Steps after which the user gives up on a device that does not echo a meal."""
+
+SAMPLE_MINUTES = 5
+
+
+class User:
+    """Announces the meals of a run, one at a time, each repeated in every step until it is echoed.
+
+    Args:
+        scenario: meals and habits.
+        mode: CtrlMode; decides what is told at all.
+        seed: of the run.
+        patient: name of the virtual patient.
+    """
+
+    def __init__(self, scenario: Scenario, mode: int, seed: int, patient: str) -> None:
+        self._scenario = scenario
+        self._policy = POLICY_OF_MODE[mode]
+        self._planned = deque(announcements(scenario, self._policy, seed, patient))
+        self._waiting: deque[Announcement] = deque()  # due, the first one is being told
+        self._number = 0  # MealId of the first one
+        self._since: int | None = None
+
+    def hear(self, last_meal: int) -> None:
+        """The device has echoed a MealId."""
+        if self._since is not None and last_meal == self._number:
+            self._next()
+
+    def _next(self) -> None:
+        self._waiting.popleft()
+        self._number = (self._number + 1) % IDS
+        self._since = None
+
+    def announce(self, step: int, rescued: Meal | None, transmitter: Transmitter) -> list[Frame]:
+        """What is told in instant `step`; `rescued` is sugar that was eaten just now."""
+        while self._planned and self._planned[0].step <= step:
+            self._waiting.append(self._planned.popleft())
+        sugar = None if rescued is None else rescue_announcement(self._scenario, self._policy, rescued)
+        if sugar is not None:
+            self._waiting.append(sugar)
+        if self._since is not None and step - self._since >= PATIENCE:
+            self._next()
+        if not self._waiting:
+            return []
+        meal = self._waiting[0]
+        if self._since is None:
+            self._since = step
+        offset = min(max((meal.meal_step - step) * SAMPLE_MINUTES, -OFFSET_MAX), OFFSET_MAX)
+        carbs = {} if meal.carbs_g is None else {"CarbsEst": round(meal.carbs_g * 2)}
+        return [transmitter.frame("MEAL_Announce", MealKind=meal.kind, MealId=self._number, MealOffset=offset, **carbs)]
