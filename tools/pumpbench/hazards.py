@@ -52,6 +52,8 @@ DELIVERING, DONE, ABORTED = 2, 3, 4
 
 BOLUS_RESERVED = 4000
 """Raw doses above this are reserved codes."""
+
+BOLUS_ID_SNA = 65535
 ALARM_INACTIVE = 0
 INSULIN_LEDGER, PRAM_LEDGER = 4, 5
 NEVER = 1 << 20
@@ -140,17 +142,16 @@ class _BolusWatch:
             self._known[drug, last].passed_by = True
         self._shown[drug] = number
         again = bolus.passed_by or delivered < bolus.delivered or (phase < bolus.phase and bolus.phase >= DONE)
-        self._hazards["H1"] += again
-        if phase == DELIVERING or delivered:
-            if bolus.too_late:
-                self._count_late(bolus)
-        elif sent is not None and sent.until is not None and step > sent.until and sent.phase < DELIVERING:
-            sent.too_late = sent is not bolus or phase < DELIVERING
+        self._hazards["H1"] += again and number != BOLUS_ID_SNA
+        if bolus.too_late and (phase in (DELIVERING, DONE) or delivered):
+            self._count_late(bolus)
+        begun = sent is bolus and phase >= DELIVERING
+        over = sent is not None and sent.until is not None and step > sent.until  # it must not begin any more
+        if sent is not None and over and not begun and sent.phase < DELIVERING:
+            sent.too_late = True
         bolus.phase, bolus.delivered, bolus.passed_by = phase, delivered, False
-        if sent is not None and not sent.settled:
-            never = sent.until is not None and step > sent.until  # the pump must not begin it any more
-            if (sent is bolus and phase >= DELIVERING) or (sent is not bolus and never):
-                sent.settled = self._resolved = True
+        if sent is not None and not sent.settled and (begun or (over and sent is not bolus)):
+            sent.settled = self._resolved = True
 
     def _count_late(self, bolus: _Bolus) -> None:
         if not bolus.counted_late:
