@@ -20,7 +20,7 @@ from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
 from . import mechanism, physiology
 from .faults import AnyPumpFault
 from .physiology import Patient, Variability
-from .pump import REPORT, Pump, PumpSettings
+from .pump import NMT_BOOT_UP, NMT_OPERATIONAL, REPORT, Pump, PumpSettings
 from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
 from .sensor import Sensor, SensorSettings
 from .user import User
@@ -33,13 +33,9 @@ GLUCOSE_UNKNOWN, RATE_UNKNOWN = 8191, -1024
 
 ALARM_PENDING = 1
 
-NMT_BOOT_UP, NMT_OPERATIONAL = 0, 5
-"""HB_PUMP.NmtPump and HB_CGM.NmtCgm, as CANopen numbers them."""
-
-
 READING: Layout = (("CGM_Reading", ("CgmState", "GlucoseConc", "GlucoseRate", "CgmSampleSeq", "CgmSampleStep"), {}),)
 HEARTBEATS: Layout = (
-    ("HB_PUMP", ("TogglePump",), {"NmtPump": NMT_OPERATIONAL, "ResetCausePump": 0, "BootPump": 0}),
+    ("HB_PUMP", ("NmtPump", "BootPump", "TogglePump"), {"ResetCausePump": 0}),
     ("HB_CGM", ("ToggleCgm",), {"NmtCgm": NMT_OPERATIONAL, "ResetCauseCgm": 0, "BootCgm": 0}),
 )
 TRUTH: Layout = tuple(
@@ -149,7 +145,7 @@ class PlantServer:
 
     def _hear_heartbeat(self, values: dict[str, int]) -> list[Frame]:
         """A device that starts anew in the middle of a run begins its E2E counters at 0, and has lost its turn."""
-        if values["NmtCtrl"] != NMT_BOOT_UP or self._phase != Phase.STEP:
+        if values["NmtCtrl"] != NMT_BOOT_UP or self._phase not in (Phase.STEP, Phase.END):
             return []
         self._receiver.reset()
         self._turns = 0
@@ -247,6 +243,7 @@ class PlantServer:
             [
                 *reading,
                 *self._pump.values(),
+                *self._pump.heartbeat(),
                 toggle,
                 toggle,
                 *self._truth(),
