@@ -382,7 +382,7 @@ def test_h1_an_id_that_comes_back_after_another_one() -> None:
     bus.next((DONE, 1, 200))
     bus.give(2)
     bus.next((DONE, 2, 200))
-    bus.next((DELIVERING, 1, 200))
+    bus.next((DONE, 1, 200))
     assert bus.found == {"H1": 1}
     bus.next((DONE, 1, 200))
     assert bus.found == {"H1": 1}
@@ -500,9 +500,18 @@ def test_h5_a_device_that_says_it_is_uncertain_and_doses() -> None:
     bus = Bolusing()
     bus.give(1)
     bus.next((DONE, 1, 200), state=6)
-    bus.next((DONE, 1, 200), state=6)
+    bus.next(state=6)  # and hears nothing of the pump since
     bus.cmd(PROGRAM, 2)
     assert bus.found == {"H5": 1}
+
+
+def test_a_device_that_hears_of_its_boluses_again_may_dose() -> None:
+    bus = Bolusing()
+    bus.give(1)
+    bus.next((DONE, 1, 200), state=6)
+    bus.next((DONE, 1, 200), state=6)
+    bus.cmd(PROGRAM, 2)
+    assert bus.found == {}
 
 
 def test_unknown_drugs_and_phases_do_not_stop_the_monitor() -> None:
