@@ -65,6 +65,8 @@ class Pair:
         self.frames_in = 0  # frames that reached the device
         self.cut_at_frame: int | None = None  # power fails when so many have
         self.boots = 0
+        self.watch: Callable[[Sequence[Frame]], None] = lambda _frames: None  # sees the device's side of the wire
+        self.watch_pump: Callable[[Sequence[Frame]], None] = lambda _frames: None  # sees the plant's side
 
     def play(self) -> "Pair":
         """To the end of the run."""
@@ -73,10 +75,15 @@ class Pair:
             assert to_device, self.plant.waiting_for
             frame = to_device.popleft()
             answers: list[Frame] = []
+            self.watch_pump([frame])
             for arrived in self._carry(self.to_device, frame):
-                answers += self._give(arrived)
+                self.watch([arrived])
+                said = self._give(arrived)
+                self.watch(said)
+                answers += said
             for answer in answers:
                 for arrived in self._carry(self.to_plant, answer):
+                    self.watch_pump([arrived])
                     to_device += self.plant.receive(arrived)
         return self
 

@@ -151,7 +151,8 @@ class _BolusWatch:
             sent.too_late = True
         bolus.phase, bolus.delivered, bolus.passed_by = phase, delivered, False
         if sent is not None and not sent.settled and (begun or (over and sent is not bolus)):
-            sent.settled = self._resolved = True
+            sent.settled = True
+        self._resolved |= sent is None or sent.settled  # a device that had lost the pump knows again where it stands
 
     def _count_late(self, bolus: _Bolus) -> None:
         if not bolus.counted_late:
