@@ -102,6 +102,8 @@ class Oracle:
         """What the mode gives: (step, drug) -> U or ug, before rounding."""
         doses: dict[tuple[int, int], float] = {}
         for step, grams in inputs.meals.items():
+            if inputs.limit[step] != 0:
+                continue  # nothing is dosed for a meal while insulin is held back
             simple = self.mode in (MODES["sma"], MODES["s4"])
             carbs = self.tuning.assumed_carbs if simple or grams is None else grams
             insulin = self.tuning.meal_factor * carbs / self.carb_ratio
@@ -112,7 +114,9 @@ class Oracle:
                 doses[step, PRAMLINTIDE] = self.ratio * np.floor(insulin * 100 + 1e-9) / 100
         if self.mode == MODES["s1"]:
             doses |= {(step, PRAMLINTIDE): self.tuning.pram_bolus for step in self.peaks(demand, inputs)}
-        return doses
+        held_back = [key for key in doses if inputs.limit[key[0]] != 0]
+        low = [key for key in doses if key[1] == PRAMLINTIDE and inputs.glucose[key[0]] < 70 - 1e-9]
+        return {key: dose for key, dose in doses.items() if key not in (*held_back, *low)}
 
     def peaks(self, demand: Floats, inputs: Inputs) -> list[int]:
         """Steps in which B_1 and B_2 of strategy 1 hold."""
