@@ -232,7 +232,6 @@ class Firmware:
             self._rejected = True
         if values["SuspendRequest"] == REQUEST_SUSPEND:
             self._suspended = True
-            self._boluses.cancel()
         elif values["SuspendRequest"] == REQUEST_RESUME:
             self._suspended = False
             self._held = False
@@ -300,6 +299,8 @@ class Firmware:
             self._count_reset(step)
         glucose = self._judge_sensor(step)
         delivered, bolus = self._hear_pump(step)
+        if self._suspended:
+            self._boluses.cancel()
         state = self._ladder.update(
             calibrated=self._calibration.active,
             suspended=self._suspended or self._mode == MODE_OFF,

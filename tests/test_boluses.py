@@ -128,6 +128,29 @@ def test_the_pumps_own_limit_is_respected() -> None:
     assert pair.alarms(Code.DOSE_REJECTED)
 
 
+def test_suspending_cancels_a_bolus_under_way_in_the_same_step() -> None:
+    """Requirement FAL-05: 9.7 U take more than a step; what is left of them at the suspension is never given."""
+    pair = Pair("ma", [(20, 149.0)], steps=40)
+    sent: list[int] = []
+
+    def wire(name: str, _values: Values, frame: Frame) -> Sequence[Frame] | None:
+        if name == "SYNC_Step" and pair.plant.step == 21 and not sent:
+            sent.append(21)
+            suspend = pair.plant._transmitter.frame("MODE_Cmd", ModeRequest=MODES["ma"], ModeCmdSeq=1, SuspendRequest=1)
+            return [suspend, frame]
+        return None
+
+    pair.to_device = wire
+    pair.play()
+    cancels = [step for step, name, values in pair.heard if name == "PUMP_BolusCmd" and values["BolusOp"] == CANCEL]
+    assert set(cancels) == {21}
+    last = [values for values in pair.all("PUMP_BolusState") if values["BolusStateHormone"] == INSULIN][-1]
+    assert 0 < last["BolusDeliveredRaw"] < last["BolusProgrammedRaw"]
+    assert not pair.alarms(Code.DELIVERY_UNCERTAIN)
+    assert pair.states()[-1] == State.SUSPENDED
+    assert pair.ledgers_close()
+
+
 # ---- a wire that fails
 
 
