@@ -115,6 +115,20 @@ class Alarms:
         if code in self._active:
             self._active[code].changed = True
 
+    def listing(self) -> list[dict[str, int | str]]:
+        """The alarms in force, highest priority first."""
+        order = sorted(self._active, key=lambda code: (-PRIORITY[code], self._active[code].instance))
+        return [
+            {
+                "code": code.name.lower(),
+                "priority": PRIORITY[code].name.lower(),
+                "state": self._active[code].state.name.lower(),
+                "instance": self._active[code].instance,
+                "aux": self._active[code].aux,
+            }
+            for code in order
+        ]
+
     def save(self) -> list[int]:
         """Words for the non-volatile memory: instances are not used twice."""
         return [self._next_instance]

@@ -113,6 +113,11 @@ class Calibration:
         """Whether a complete, checked set is in force."""
         return bool(self._active)
 
+    @property
+    def values(self) -> dict[str, int]:
+        """The set in force, raw values by name."""
+        return dict(self._active)
+
     def value(self, name: str) -> int:
         """Raw value of a parameter of `UNSET` in force, e.g. a limit that the control core does not know."""
         return self._active.get(name, UNSET[name])

@@ -98,6 +98,8 @@ class Firmware:
 
     def __init__(self, memory: Memory | None = None, cause: Cause = Cause.POWER_ON) -> None:
         self.finished = False
+        self.reset_requested = False
+        self.log: Callable[[str, int, str, str], None] = lambda _level, _seconds, _module, _text: None
         self._nvm = None if memory is None else Nvm(memory, NVM_WORDS)
         self._cause = cause
         self._handlers: dict[str, Callable[[dict[str, int]], None]] = {
@@ -471,6 +473,7 @@ class Firmware:
         alarms.hold(Code.STATE_CHANGE, step - self._last_change < ALARM_HOLD, state)
         if state != self._reported_state:
             # every change of state is told with its cause in the same step, also to a user who has confirmed it
+            self.log("info", step * STEP_SECONDS, "ladder", f"{self._reported_state.name} -> {state.name}")
             self._reported_state = state
             alarms.repeat(Code.CGM_LOST)
             alarms.repeat(Code.PUMP_LOST)
@@ -567,3 +570,42 @@ class Firmware:
             part.restore(words)
         self._state[:] = [next(words) for _ in layout.STATE]
         self._reset_here = True
+
+    # ---- what the console sees
+
+    def status(self) -> dict[str, int | str]:
+        """The newest step; rates and doses raw, as in the DBC."""
+        step = -1 if self._step is None else self._step
+        return {
+            "step": step,
+            "time": max(step, 0) * STEP_SECONDS,
+            "state": self._ladder.state.name.lower(),
+            "mode": self._mode,
+            "glucose": self._inputs[layout.IN_GLUCOSE],
+            "cgm_age": min(self._cgm.age(max(step, 0)), STEP_SNA),
+            "rate": self._outputs[layout.OUT_RATE],
+            "pram_rate": self._outputs[layout.OUT_PRAM_RATE],
+            "iob": self._outputs[layout.OUT_IOB],
+            "limiters": self._outputs[layout.OUT_LIMITERS],
+            "e2e_errors": self._receiver.crc_errors + self._receiver.malformed,
+            "lost_frames": self._lost_frames(),
+            "boots": self._boots,
+        }
+
+    def parameters(self) -> dict[str, int]:
+        """The calibration in force, raw values by DBC name."""
+        return self._calibration.values
+
+    def faults(self) -> list[dict[str, int | str]]:
+        """Alarms in force, highest priority first."""
+        return self._alarms.listing()
+
+    def version(self) -> dict[str, int | str]:
+        """Of this firmware, and of the protocol it speaks."""
+        major, minor = dbc.protocol_version()
+        return {"firmware": f"{VERSION[0]}.{VERSION[1]}", "protocol": f"{major}.{minor}", "dbc_crc": dbc.crc32()}
+
+    def request_reset(self) -> bool:
+        """Ask whoever runs this device to restart it; False without a memory to restart from."""
+        self.reset_requested = self._nvm is not None
+        return self.reset_requested

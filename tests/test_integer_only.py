@@ -12,8 +12,8 @@ from firmware_sim.firmware import Firmware
 
 ROOM = Path(firmware_sim.__file__).parent
 
-SOURCES = sorted(path for path in ROOM.rglob("*.py") if path.name != "__main__.py")
-"""Everything a frame can reach; __main__ only opens the bus."""
+SOURCES = sorted(path for path in ROOM.rglob("*.py") if path.name not in ("__main__.py", "serial_port.py"))
+"""Everything a frame can reach; __main__ only opens the bus, and serial_port the console's port."""
 
 ALLOWED_IMPORTS = {"binascii", "collections", "dataclasses", "enum", "typing", "dbc", "can_bus"}
 """Beside the firmware's own modules. A list of what is allowed, so that nothing slips in under a new name."""

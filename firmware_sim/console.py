@@ -1,0 +1,201 @@
+"""The serial console: lines in, key=value replies out. Pure logic; `serial_port` moves the bytes.
+
+It can look at everything and change nothing that doses: there is no command for a dose, a limit or the calibration.
+A reply is one line of key=value pairs (or several for a list), then `OK` or `ERR <number> <reason>`.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol
+
+LINE_MAX = 128
+"""Characters of a line; a longer one is refused as a whole."""
+
+LOG_LINES = 256
+"""Log lines that wait for a reader; older ones are dropped and counted, for nothing here may ever wait."""
+
+LEVELS = ("off", "error", "warn", "info", "debug")
+
+ERR_UNKNOWN, ERR_USAGE, ERR_READ_ONLY, ERR_LINE, ERR_REFUSED = 1, 2, 3, 4, 5
+
+HELP = (
+    ("help", "this list"),
+    ("status", "state, mode, doses and counters of the newest step"),
+    ("get [NAME]", "a calibration parameter as stored, raw; without a name all of them"),
+    ("set NAME=VALUE", "a setting of the console: echo=on|off, log=LEVEL; nothing else can be set"),
+    ("log LEVEL", "log lines to show: " + " ".join(LEVELS)),
+    ("version", "of the firmware and of the protocol"),
+    ("faults", "alarms in force, highest first"),
+    ("reset", "restart from the non-volatile memory after this turn"),
+)
+
+Pairs = Mapping[str, int | str]
+
+
+class Device(Protocol):
+    """What the console may ask a device."""
+
+    def status(self) -> Pairs:
+        """The newest step."""
+
+    def parameters(self) -> Mapping[str, int]:
+        """The calibration in force, raw values by DBC name."""
+
+    def faults(self) -> Iterable[Pairs]:
+        """Alarms in force."""
+
+    def version(self) -> Pairs:
+        """Of firmware and protocol."""
+
+    def request_reset(self) -> bool:
+        """Ask for a restart at the end of the turn; False: this device has no memory to restart from."""
+
+
+class _Refused(Exception):
+    def __init__(self, number: int, reason: str) -> None:
+        self.number = number
+        self.reason = reason
+        super().__init__(reason)
+
+
+def pairs(values: Pairs) -> str:
+    """One line of key=value pairs."""
+    return " ".join(f"{key}={value}" for key, value in values.items())
+
+
+class Console:
+    """One session on one port.
+
+    Attributes:
+        dropped: log lines that nobody read in time.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._line = bytearray()
+        self._overlong = False
+        self._last = 0  # byte before, so that CR LF is one line end
+        self._echo = True
+        self._level = LEVELS.index("off")
+        self._log: deque[str] = deque()
+        self.dropped = 0
+        self._commands: dict[str, Callable[[str], list[str]]] = {
+            "help": self._help,
+            "status": self._status,
+            "get": self._get,
+            "set": self._set,
+            "log": self._set_level,
+            "version": self._version,
+            "faults": self._faults,
+            "reset": self._reset,
+        }
+
+    def log(self, level: str, seconds: int, module: str, text: str) -> None:
+        """Offer a log line, stamped with simulated time; it waits for the next `feed` or is dropped."""
+        if not 0 < LEVELS.index(level) <= self._level:
+            return
+        if len(self._log) == LOG_LINES:
+            self._log.popleft()
+            self.dropped += 1
+        self._log.append(f"{level[0].upper()} ({seconds}) {module}: {text}")
+
+    def feed(self, data: bytes) -> bytes:
+        """Take what was typed, any bytes; what is to be shown, waiting log lines first."""
+        out = bytearray()
+        while self._log:
+            out += self._log.popleft().encode("ascii", "replace") + b"\r\n"
+        for byte in data:
+            if byte in b"\r\n":
+                if not (byte == 10 and self._last == 13):
+                    out += self._end_of_line()
+            elif byte in (8, 127):
+                if self._line:
+                    self._line.pop()
+                    out += b"\b \b" if self._echo else b""
+            elif len(self._line) == LINE_MAX:
+                self._overlong = True
+            else:
+                self._line.append(byte)
+                out += bytes([byte]) if self._echo and 32 <= byte < 127 else b""
+            self._last = byte
+        return bytes(out)
+
+    def _end_of_line(self) -> bytes:
+        line, overlong = bytes(self._line), self._overlong
+        self._line.clear()
+        self._overlong = False
+        lines = self._answer(line, overlong)
+        out = b"\r\n" if self._echo else b""
+        out += b"".join(text.encode("ascii", "replace") + b"\r\n" for text in lines)
+        return out + (b"> " if self._echo else b"")
+
+    def _answer(self, line: bytes, overlong: bool) -> list[str]:
+        try:
+            if overlong:
+                raise _Refused(ERR_LINE, f"a line has at most {LINE_MAX} characters")
+            if any(not 32 <= byte < 127 for byte in line):
+                raise _Refused(ERR_LINE, "a line is plain ASCII text")
+            name, _, rest = line.decode("ascii").strip().partition(" ")
+            if not name:
+                return []
+            command = self._commands.get(name)
+            if command is None:
+                raise _Refused(ERR_UNKNOWN, "no such command, see help")
+            return [*command(rest.strip()), "OK"]
+        except _Refused as refused:
+            return [f"ERR {refused.number} {refused.reason}"]
+
+    # ---- commands
+
+    def _nothing(self, rest: str, name: str) -> None:
+        if rest:
+            raise _Refused(ERR_USAGE, f"usage: {name}")
+
+    def _help(self, rest: str) -> list[str]:
+        self._nothing(rest, "help")
+        return [f"{usage}: {what}" for usage, what in HELP]
+
+    def _status(self, rest: str) -> list[str]:
+        self._nothing(rest, "status")
+        return [pairs({**self._device.status(), "dropped": self.dropped})]
+
+    def _get(self, rest: str) -> list[str]:
+        parameters = self._device.parameters()
+        if not rest:
+            return [pairs({name: value}) for name, value in parameters.items()]
+        if rest not in parameters:
+            raise _Refused(ERR_USAGE, "no such parameter is stored, get lists them")
+        return [pairs({rest: parameters[rest]})]
+
+    def _set(self, rest: str) -> list[str]:
+        name, equals, value = rest.partition("=")
+        if not equals:
+            raise _Refused(ERR_USAGE, "usage: set NAME=VALUE")
+        if name == "log":
+            return self._set_level(value)
+        if name != "echo":
+            raise _Refused(ERR_READ_ONLY, "only echo and log can be set here, nothing that doses")
+        if value not in ("on", "off"):
+            raise _Refused(ERR_USAGE, "usage: set echo=on|off")
+        self._echo = value == "on"
+        return []
+
+    def _set_level(self, rest: str) -> list[str]:
+        if rest not in LEVELS:
+            raise _Refused(ERR_USAGE, "usage: log " + "|".join(LEVELS))
+        self._level = LEVELS.index(rest)
+        return []
+
+    def _version(self, rest: str) -> list[str]:
+        self._nothing(rest, "version")
+        return [pairs(self._device.version())]
+
+    def _faults(self, rest: str) -> list[str]:
+        self._nothing(rest, "faults")
+        return [pairs(fault) for fault in self._device.faults()]
+
+    def _reset(self, rest: str) -> list[str]:
+        self._nothing(rest, "reset")
+        if not self._device.request_reset():
+            raise _Refused(ERR_REFUSED, "there is no non-volatile memory to restart from")
+        return []
