@@ -3,6 +3,7 @@
 import random
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from bench import S2, Bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_sim.__main__ import attend
 from firmware_sim.console import LINE_MAX, LOG_LINES, Console
 from firmware_sim.firmware import NVM_WORDS, Firmware
 from firmware_sim.nvm import RamMemory, memory_size
@@ -183,3 +185,66 @@ def test_the_console_of_a_running_firmware(tmp_path: Path) -> None:
         if firmware is not None:
             firmware.kill()
             firmware.wait()
+
+
+# ---- pumpbench console
+
+
+class Answering:
+    """A console behind a pseudo terminal, served by a thread."""
+
+    def __init__(self, firmware: Firmware, link: Path) -> None:
+        self.port = SerialPort(f"pty:{link}")
+        self.over = threading.Event()
+        self.thread = threading.Thread(target=attend, args=(self.port, Console(firmware), self.over), daemon=True)
+
+    def __enter__(self) -> "Answering":
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.over.set()
+        self.thread.join()
+        self.port.close()
+
+
+def run_console(*arguments: str, stdin: str = "") -> tuple[int, str, str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "pumpbench", "console", *arguments],
+        check=False,
+        input=stdin,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_commands_of_a_script(bench: Bench, tmp_path: Path) -> None:
+    link = tmp_path / "tty"
+    with Answering(bench.firmware, link):  # type: ignore[arg-type]
+        status, out, _ = run_console(str(link), "--command", "get CfgBasal", "--command", "faults")
+        assert (status, out) == (0, "CfgBasal=1425\nOK\nOK\n")
+        status, out, _ = run_console(str(link), "--command", "set rate=5", "--command", "get CfgBasal")
+        assert status == 1
+        assert out.splitlines() == [
+            "ERR 3 only echo and log can be set here, nothing that doses",
+            "CfgBasal=1425",
+            "OK",
+        ]
+
+
+def test_commands_from_a_pipe(bench: Bench, tmp_path: Path) -> None:
+    with Answering(bench.firmware, tmp_path / "tty"):  # type: ignore[arg-type]
+        status, out, _ = run_console(str(tmp_path / "tty"), stdin="version\n\nstatus\n")
+    assert status == 0
+    assert out.count("OK") == 2
+
+
+def test_no_port_and_no_answer_are_one_line_each(tmp_path: Path) -> None:
+    status, _, err = run_console(str(tmp_path / "nothing"), "--command", "status")
+    assert status == 2 and "nothing" in err and err.count("\n") == 1
+    port = SerialPort("pty")
+    status, _, err = run_console(port.name, "--command", "status", "--timeout", "0.2")
+    port.close()
+    assert (status, err) == (3, "pumpbench: nobody answers on this port within 0.2 s\n")
