@@ -23,6 +23,8 @@ from can_bus.frame import Frame
 
 STEP_SECONDS = 300
 STEPS_PER_DAY = 86400 // STEP_SECONDS
+EXEC_TIME_SNA = 65535
+
 TURNS_PER_STEP = 32
 """Further turns a device may ask for in one instant before the plant calls it stuck."""
 
@@ -79,10 +81,14 @@ class Turn:
         self._frames = []
         return frames
 
-    def close(self, step: int, status: Done = Done.OK) -> list[Frame]:
-        """All queued frames and SYNC_Done, whose TxCount counts them and itself."""
+    def close(self, step: int, status: Done = Done.OK, work: int | None = None) -> list[Frame]:
+        """All queued frames and SYNC_Done, whose TxCount counts them and itself; `work` is told as ExecTime."""
         frames = self.take()
         done = self.transmitter.frame(
-            "SYNC_Done", DoneStatus=status, DoneStepIndex=step, TxCount=min(len(frames) + 1, 254)
+            "SYNC_Done",
+            DoneStatus=status,
+            DoneStepIndex=step,
+            ExecTime=EXEC_TIME_SNA if work is None else min(work, EXEC_TIME_SNA - 1),
+            TxCount=min(len(frames) + 1, 254),
         )
         return [*frames, done]

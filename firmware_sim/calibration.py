@@ -114,6 +114,16 @@ class Calibration:
         return bool(self._active)
 
     @property
+    def intact(self) -> bool:
+        """Whether what is in force is still what was checked when it was activated."""
+        if not self._active:
+            return True
+        index = {name: number for number, name in self._names.items()}
+        stored = set_crc({index[name]: raw for name, raw in self._active.items()}) == self._active_crc
+        used = [self._active.get(name, UNSET.get(name, 0)) for name in (CORE[word.name] for word in layout.PARAMETERS)]
+        return stored and used == list(self.parameters)
+
+    @property
     def values(self) -> dict[str, int]:
         """The set in force, raw values by name."""
         return dict(self._active)

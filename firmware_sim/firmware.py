@@ -29,11 +29,19 @@ from .ladder import AGE_DEGRADED, Ladder, State
 from .meals import Meals
 from .nvm import Memory, Nvm
 from .pump import Op, Pump
+from .scheduler import Scheduler, Task
+from .selftest import Failure, check_program, check_ram
 
 VERSION = (0, 2)
 
 SUPPORTED_MODES = tuple(range(MODE_OFF, MODE_S4 + 1))
 """Modes this build accepts from MODE_Cmd; any other is refused with DoseRejected."""
+
+FRAMES_AT_MOST = 512
+"""Frames between two tokens that the device can handle; more is an overrun."""
+
+STOPS = Failure.PROGRAM | Failure.RAM | Failure.PARAMETERS
+"""Failures after which nothing is commanded; a lost memory leaves the device without a calibration anyway."""
 
 NVM_WORDS = 320
 """Room for everything that survives a reset."""
@@ -119,6 +127,8 @@ class Firmware:
         record = None if self._nvm is None else self._nvm.load()
         if record is not None:
             self._restore(iter(record))
+        elif self._nvm is not None and self._nvm.damaged:
+            self._failures |= Failure.MEMORY  # nothing is known: not even the calibration, so nothing is commanded
 
     def _boot(self) -> None:
         """Everything as after power-on."""
@@ -145,6 +155,11 @@ class Firmware:
         self._totals: dict[str, int] | None = None
         self._status: dict[str, int] | None = None
         self._rejected = False
+        self._scheduler = Scheduler(self._tasks())
+        self._frames_heard = 0
+        self._work = 0  # counted in this step
+        self._glucose, self._delivered, self._bolus, self._skipped = -1, -1, 0, 0  # found by the tasks of this step
+        self._failures = check_program() | check_ram(self._state, self._inputs, self._outputs)
         self._turn_open = False  # the step waits for the pump's answers
         self._refused_seen = 0
         self._boots = 0
@@ -180,6 +195,7 @@ class Firmware:
     def receive(self, frame: Frame) -> Sequence[Frame]:
         """Take one frame; only a token is answered."""
         check, name, values, _ = self._receiver.receive(frame)
+        self._frames_heard += check != Check.UNKNOWN
         if check > Check.OK_SOME_LOST:
             if check in (Check.REPEATED, Check.WRONG_SEQUENCE) and name == "CGM_Reading":
                 self._cgm.skip()
@@ -268,7 +284,9 @@ class Firmware:
             self._report_alarms(self._ladder.state, step)
             self._report_status(self._ladder.state)
         self._store()
-        return self._turn.close(step, Done.CONTINUE if self._turn_open else Done.OK)
+        if self._turn_open:
+            return self._turn.close(step, Done.CONTINUE)
+        return self._turn.close(step, Done.OVERRUN if self._scheduler.late else Done.OK, self._work)
 
     def _check_clock(self, step: int, sim_time: int) -> None:
         off = sim_time - step * STEP_SECONDS
@@ -295,15 +313,49 @@ class Firmware:
         return answer
 
     def _run_step(self, step: int) -> None:
-        skipped = 0 if self._step is None else step - self._step - 1
+        self._skipped = 0 if self._step is None else step - self._step - 1
         self._step = step
         if self._reset_here and self._last_reset < 0:
             self._count_reset(step)
-        glucose = self._judge_sensor(step)
-        delivered, bolus = self._hear_pump(step)
+        self._work = self._scheduler.run(step * STEP_SECONDS)
+
+    def _tasks(self) -> tuple[Task, ...]:
+        """The tasks in the order in which they run; a later one sees what an earlier one has found."""
+        return (
+            Task("inputs", STEP_SECONDS, FRAMES_AT_MOST, self._count_inputs),
+            Task("sensor", STEP_SECONDS, 16, self._task_sensor),
+            Task("pump", STEP_SECONDS, 4, self._task_pump),
+            Task("self_test", 3600, 4, self._task_self_test),
+            Task("ladder", STEP_SECONDS, 1, self._task_ladder),
+            Task("control", STEP_SECONDS, SKIPPED_AT_MOST + 1, self._task_control),
+            Task("command", STEP_SECONDS, 3, self._task_command),
+        )
+
+    def _count_inputs(self) -> int:
+        frames = self._frames_heard
+        self._frames_heard = 0
+        return frames
+
+    def _task_sensor(self) -> int:
+        samples = len(self._samples)
+        self._glucose = self._judge_sensor(self._now)
+        return samples + 1
+
+    def _task_pump(self) -> int:
+        self._delivered, self._bolus = self._hear_pump(self._now)
         if self._suspended:
             self._boluses.cancel()
-        state = self._ladder.update(
+        return 1
+
+    def _task_self_test(self) -> int:
+        """Once an hour: the calibration in force is still the one that was checked."""
+        if not self._calibration.intact:
+            self._failures |= Failure.PARAMETERS
+        return 1
+
+    def _task_ladder(self) -> int:
+        step = self._now
+        self._ladder.update(
             calibrated=self._calibration.active,
             suspended=self._suspended or self._mode == MODE_OFF,
             age=self._cgm.age(step),
@@ -311,14 +363,26 @@ class Firmware:
             pump_age=self._pump.age(step),
             uncertain=self._boluses.uncertain,
             held=self._held,
+            fault=bool(self._failures & STOPS) or self._scheduler.bitten,
             age_degraded=self._stale_age(),
         )
-        self._catch_up(skipped)
+        return 1
+
+    def _task_control(self) -> int:
+        steps = self._catch_up(self._skipped)
+        delivered = self._delivered
         if delivered > 0:  # what the schedule gave in the steps that were caught up has been counted there
-            delivered = max(delivered - self._scheduled(skipped), 0)
-        self._control(state, glucose, delivered, bolus)
-        self._command(state, step)
-        self._start_boluses(step)
+            delivered = max(delivered - self._scheduled(self._skipped), 0)
+        self._control(self._ladder.state, self._glucose, delivered, self._bolus)
+        return steps + 1
+
+    def _task_command(self) -> int:
+        self._command(self._ladder.state, self._now)
+        return 1 + self._start_boluses(self._now)
+
+    @property
+    def _now(self) -> int:
+        return -1 if self._step is None else self._step
 
     def _stale_age(self) -> int:
         """CfgStaleCgmLimit as the age of a sample, in steps; it can only tighten (requirement USR-05)."""
@@ -334,18 +398,20 @@ class Firmware:
         """Insulin (mU) of the schedule in some steps."""
         return round_divide(self._calibration.parameters[layout.BASAL] * steps, 12)
 
-    def _catch_up(self, skipped: int) -> None:
-        """Let insulin on board and the filters age by steps that never came (requirement TIM-02)."""
+    def _catch_up(self, skipped: int) -> int:
+        """Let insulin on board and the filters age by steps that never came (requirement TIM-02); how many."""
         if not self._calibration.active:
-            return
+            return 0
         inputs = self._inputs
-        for _ in range(min(skipped, SKIPPED_AT_MOST)):
+        steps = min(skipped, SKIPPED_AT_MOST)
+        for _ in range(steps):
             inputs[:] = [0] * len(inputs)
             inputs[layout.IN_GLUCOSE] = -1
             inputs[layout.IN_DELIVERED] = -1
             inputs[layout.IN_MODE] = self._mode
             inputs[layout.IN_LIMIT] = layout.LIMIT_SCHEDULE
             control_step(self._state, self._calibration.parameters, inputs, self._outputs)
+        return steps
 
     def _judge_sensor(self, step: int) -> int:
         self._cgm.stuck_limit = self._calibration.value("CfgStuckSamples")
@@ -419,10 +485,11 @@ class Firmware:
         limit = self._calibration.value("CfgPramTdd")
         return max(limit - delivered - self._boluses.remaining(Drug.PRAMLINTIDE), 0)
 
-    def _start_boluses(self, step: int) -> None:
-        """Start what the law decided on, within what the pump accepts."""
+    def _start_boluses(self, step: int) -> int:
+        """Start what the law decided on, within what the pump accepts; how many."""
+        started = 0
         for drug, word in ((Drug.INSULIN, layout.OUT_BOLUS), (Drug.PRAMLINTIDE, layout.OUT_PRAM_BOLUS)):
-            wanted = self._outputs[word] if self._calibration.active else 0
+            wanted = self._outputs[word] if self._ladder.state == State.AUTO else 0
             if wanted == 0:
                 continue
             dose = min(wanted, self._boluses.limit[drug])
@@ -430,6 +497,8 @@ class Firmware:
                 self._outputs[layout.OUT_LIMITERS] |= layout.LIMITER_MAX_BOLUS
             if dose > 0:
                 self._boluses.start(drug, dose, step)
+                started += 1
+        return started
 
     def _command(self, state: State, step: int) -> None:
         if state == State.DELIVERY_UNCERTAIN and self._ladder.rung == State.SAFE_BASAL:
@@ -439,7 +508,7 @@ class Firmware:
             self._pump.command(self._turn, Op.SET_RATE, step, rate, pramlintide if rate > 0 else 0)
         elif state == State.SUSPENDED:
             self._pump.command(self._turn, Op.SUSPEND, step)
-        elif self._calibration.active:
+        elif self._calibration.active and state != State.FAULT:
             self._pump.command(self._turn, Op.RESUME_SCHEDULE, step)
 
     def _report_alarms(self, state: State, step: int) -> None:
@@ -469,7 +538,8 @@ class Firmware:
         alarms.hold(Code.URGENT_LOW, self._urgent, step)
         alarms.hold(Code.CLOCK_JUMP, step - self._last_jump < ALARM_HOLD, step)
         alarms.hold(Code.NODE_RESET, step - self._last_reset < ALARM_HOLD, self._boots)
-        alarms.hold(Code.SELF_TEST, self._nvm is not None and self._nvm.damaged, step)
+        alarms.hold(Code.WATCHDOG, bool(self._scheduler.late) or self._scheduler.bitten, self._scheduler.overruns)
+        alarms.hold(Code.SELF_TEST, self._failures != Failure.NONE, self._failures)
         alarms.hold(Code.STATE_CHANGE, step - self._last_change < ALARM_HOLD, state)
         if state != self._reported_state:
             # every change of state is told with its cause in the same step, also to a user who has confirmed it

@@ -52,6 +52,7 @@ class Ladder:
         pump_age: int,
         uncertain: bool = False,
         held: bool = False,
+        fault: bool = False,
         age_degraded: int = AGE_DEGRADED,
     ) -> State:
         """One step.
@@ -64,10 +65,13 @@ class Ladder:
             pump_age: steps since the pump's status and totals were both heard.
             uncertain: a bolus may or may not have been delivered.
             held: nothing but the schedule until the user resumes (too many resets).
+            fault: the device has found a fault in itself: nothing is commanded, until it restarts.
             age_degraded: age from which on at most the schedule is given; can only be tightened.
         """
         self._rung = State.SAFE_BASAL if held else self._next_rung(age, streak, min(age_degraded, AGE_DEGRADED))
-        if not calibrated:
+        if fault:
+            self.state = State.FAULT
+        elif not calibrated:
             self.state = State.INIT
         elif suspended:
             self.state = State.SUSPENDED

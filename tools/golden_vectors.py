@@ -5,7 +5,8 @@
 
 A file is a log in candump format, `(time) can0 ID#DATA R` towards the device and `T` from it, from the calibration to
 the end of one day of the validation scenario: what stands between two SYNC_Step is one turn. Feed the R frames to an
-implementation and compare what it sends with the T frames, byte by byte. `python-can`'s CanutilsLogReader reads it.
+implementation and compare what it sends with the T frames, byte by byte; only ExecTime of SYNC_Done, and with it that
+frame's CHECKSUM, is every implementation's own. `python-can`'s CanutilsLogReader reads it.
 """
 
 import argparse
