@@ -16,11 +16,11 @@ FAULTS = """faults:
   - {kind: drop, message: CGM_Reading, start: "02:00", end: "03:00"}
 """
 
-FORTNIGHT = (
+FORTNIGHT = (  # the mode with the most on the wire: announcements, boluses of both drugs, further turns
     "--patient",
     "adult#001",
     "--strategy",
-    "nma",
+    "s3",
     "--scenario",
     "validation-14d",
     "--days",
