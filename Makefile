@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test nightly lint docs benchmark clean
+.PHONY: help setup run test nightly mutation lint docs benchmark clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -24,8 +24,13 @@ run: setup       ## one closed-loop day over the embedded bus, with a recording
 test: setup      ## linters, then all tests: on the embedded bus here, on a real vcan through tools/with_vcan
 	tools/run_tests
 
-nightly: setup   ## the hostile tests for long: 10000 sequences, a million random frames
-	PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 $(BIN)/python -m pytest tests/test_hostile.py
+nightly: setup   ## the long tests: 10000 hostile sequences, a million random frames, the oracle in all pairs
+	PUMPBENCH_NIGHTLY=1 PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 \
+	  $(BIN)/python -m pytest --timeout 3600 tests/test_hostile.py tests/test_float_oracle.py
+
+mutation: setup  ## mutation score of the dosing, limits, protocol and memory modules (about an hour)
+	$(BIN)/mutmut run
+	$(BIN)/mutmut results
 
 lint: setup      ## ruff, mypy, import-linter, generated files up to date
 	tools/run_lint
