@@ -62,6 +62,9 @@ PRIORITY = {
 STEPS_AT_LEAST = 6
 """Steps an alarm lasts however soon its cause ends, so that a flapping cause raises one alarm in 30 min (FAL-03)."""
 
+STEPS_CONFIRMED = 6
+"""Steps after which an alarm that was confirmed or snoozed is pending again if its cause still holds (ALM-04)."""
+
 INSTANCES = 65535
 """Instance numbers run from 0 to 65534; 65535 is SNA."""
 
@@ -73,6 +76,7 @@ class _Alarm:
     aux: int
     changed: bool = True
     steps: int = 0  # reported so far
+    quiet: int = 0  # steps since the user confirmed or snoozed it
 
 
 class Alarms:
@@ -97,6 +101,10 @@ class Alarms:
             self._next_instance = (self._next_instance + 1) % INSTANCES
         elif cause and alarm is not None:
             alarm.aux = aux & 0xFFFF
+            alarm.quiet = alarm.quiet + 1 if alarm.state in (State.CONFIRMED, State.SNOOZED) else 0
+            if alarm.quiet > STEPS_CONFIRMED:
+                alarm.state = State.PENDING
+                alarm.quiet = 0
         elif alarm is not None and alarm.steps >= STEPS_AT_LEAST and alarm.state != State.INACTIVE:
             alarm.state = State.INACTIVE
             alarm.changed = True

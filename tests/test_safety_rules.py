@@ -265,3 +265,26 @@ def test_a_day_forgets_by_the_hour_and_never_too_early() -> None:
     other = Day()
     other.restore(iter(day.save()))
     assert other.total == day.total
+
+
+# ---- alarms that last
+
+
+@pytest.mark.parametrize("action", [1, 2])
+def test_an_alarm_whose_cause_stays_comes_back_half_an_hour_after_it_was_confirmed(action: int) -> None:
+    """Requirement ALM-04: neither confirming nor snoozing removes the cause."""
+    bench = Bench(mode=NMA)
+    bench.run(5)
+    for _ in range(4):
+        turn = bench.step(drop=True)
+    (alarm,) = turn.alarms(Code.CGM_LOST)
+    number = alarm["CtrlAlarmInstance"]
+    bench.send("UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=action, AlarmAckInstance=number)
+    states = []
+    for _ in range(9):
+        told = bench.step(drop=True).alarms(Code.CGM_LOST)
+        states.append(told[0]["CtrlAlarmState"] if told else None)
+        assert not told or told[0]["CtrlAlarmInstance"] == number
+    pending = states.index(1)
+    assert pending == 6
+    assert states[pending:] == [1] * (9 - pending)
