@@ -98,8 +98,9 @@ def test_a_sample_more_than_50_below_a_waiting_rise_is_a_rise_of_its_own(second:
     cgm = heard(1500)
     cgm.judge([sample(1, 5000)], 1)
     assert (cgm.judge([sample(2, second)], 2).glucose == second) == used
-    if not used:  # and it is the one the next sample must agree with: 4800 is near to neither 5000 nor 2501
-        assert cgm.judge([sample(3, second + 501)], 3).glucose == (-1 if second + 501 - 1500 > 1500 else second + 501)
+    if not used:  # and it is the one the next sample must agree with
+        assert cgm.judge([sample(3, second + 501)], 3).glucose == -1
+        assert cgm.judge([sample(3, second + 1001)], 3).glucose == second + 1001
 
 
 def test_two_outliers_that_agree_in_the_same_step_are_not_told_from_a_rise() -> None:
