@@ -145,6 +145,12 @@ class Alarms:
         """Take back what `save` wrote; causes that still hold raise their alarms anew."""
         self._next_instance = next(words)
 
+    def renew(self, code: Code) -> None:
+        """Something new of the same kind: pending again, also for a user who has confirmed the last one."""
+        if code in self._active:
+            self._active[code].state = State.PENDING
+            self._active[code].changed = True
+
     def report(self, turn: Turn) -> None:
         """Send what changed and what is pending, highest priority first; forget what has ended."""
         order = sorted(self._active, key=lambda code: (-PRIORITY[code], self._active[code].instance))

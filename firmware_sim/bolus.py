@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 from can_bus.lockstep import Turn
 
+from .pump import accepted_limit
+
 SENDS = 3
 """Times a command is sent at most (project's choice)."""
 
@@ -49,7 +51,7 @@ ACKS = {
 }
 """PUMP_Ack.AckFor of the stages; `CANCEL_ACK` names no drug, its id does."""
 
-ACCEPTED, DUPLICATE, OVER_LIMIT = 0, 1, 3
+ACCEPTED, DUPLICATE = 0, 1
 """PUMP_Ack.AckResult."""
 
 
@@ -119,8 +121,7 @@ class Boluses:
             stage = ACKS.get(purpose) == (drug, bolus.op) or (purpose == CANCEL_ACK and bolus.op == Op.CANCEL)
             if stage and number == bolus.number:
                 bolus.ack = (values["AckResult"], values["AckEchoRaw"])
-                if values["AckResult"] == OVER_LIMIT:
-                    self.limit[drug] = values["AckLimitRaw"]
+                self.limit[drug] = accepted_limit(values, self.limit[drug])
 
     def hear_state(self, values: dict[str, int]) -> None:
         """A PUMP_BolusState of this step."""

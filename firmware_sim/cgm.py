@@ -80,8 +80,7 @@ class Cgm:
         if session not in (SESSION_SNA, self._session):
             if self._session != SESSION_SNA:
                 self.since_gap = 0
-                self._unconfirmed = -1
-                self._glucose_last = -1
+                self._unconfirmed = self._glucose_last = self._value_last = -1
             self._session = session
 
     def age(self, step: int) -> int:
@@ -147,8 +146,10 @@ class Cgm:
 
     def _stuck(self, value: int, state: int) -> bool:
         """Whether this value has come too often in a row (requirement SEN-07); beyond the range it may."""
-        equal = value == self._value_last and state == STATE_OK
-        self._equal = self._equal + 1 if equal else 1
+        if state != STATE_OK:
+            self._equal, self._value_last = 0, -1
+            return False
+        self._equal = self._equal + 1 if value == self._value_last else 1
         self._value_last = value
         return 0 < self.stuck_limit <= self._equal
 
@@ -168,7 +169,7 @@ class Cgm:
         """Words for the non-volatile memory: which sample was used last, so that none is used twice."""
         sequence = -1 if self._sequence is None else self._sequence
         taken = -1 if self._taken is None else self._taken
-        return [sequence, taken, self._session, int(self.doubtful)]
+        return [sequence, taken, self._session, int(self.doubtful), self._glucose_last]
 
     def restore(self, words: Iterator[int]) -> None:
         """Take back what `save` wrote; trends start anew."""
@@ -176,6 +177,7 @@ class Cgm:
         self._sequence = None if sequence < 0 else sequence
         self._taken = None if taken < 0 else taken
         self.doubtful = next(words) == 1
+        self._glucose_last = next(words)
 
     @staticmethod
     def _glucose(sample: dict[str, int]) -> int:

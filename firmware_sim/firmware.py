@@ -410,6 +410,8 @@ class Firmware:
             inputs[layout.IN_DELIVERED] = -1
             inputs[layout.IN_MODE] = self._mode
             inputs[layout.IN_LIMIT] = layout.LIMIT_SCHEDULE
+            inputs[layout.IN_INSULIN_LEFT] = self._insulin_left()
+            inputs[layout.IN_PRAM_LEFT] = self._pram_left()
             control_step(self._state, self._calibration.parameters, inputs, self._outputs)
         return steps
 
@@ -505,7 +507,8 @@ class Firmware:
             self._pump.command(self._turn, Op.RESUME_SCHEDULE, step)
         elif state in (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN):
             rate, pramlintide = self._outputs[layout.OUT_RATE], self._outputs[layout.OUT_PRAM_RATE]
-            self._pump.command(self._turn, Op.SET_RATE, step, rate, pramlintide if rate > 0 else 0)
+            if self._pump.command(self._turn, Op.SET_RATE, step, rate, pramlintide if rate > 0 else 0):
+                self._outputs[layout.OUT_LIMITERS] |= layout.LIMITER_MAX_BASAL
         elif state == State.SUSPENDED:
             self._pump.command(self._turn, Op.SUSPEND, step)
         elif self._calibration.active and state != State.FAULT:
@@ -548,6 +551,8 @@ class Firmware:
             alarms.repeat(Code.CGM_LOST)
             alarms.repeat(Code.PUMP_LOST)
             alarms.repeat(Code.DELIVERY_UNCERTAIN)
+            if self._last_change == step:
+                alarms.renew(Code.STATE_CHANGE)
         alarms.report(self._turn)
 
     def _report_status(self, state: State) -> None:
@@ -604,6 +609,7 @@ class Firmware:
             -1 if self._mode_sequence is None else self._mode_sequence,
             int(self._suspended),
             int(self._held),
+            self._clock_caution,
             *resets,
             *self._meals.save(),
             *self._boluses.save(),
@@ -626,6 +632,7 @@ class Firmware:
         self._mode_sequence = None if sequence < 0 else sequence
         self._suspended = next(words) == 1
         self._held = next(words) == 1
+        self._clock_caution = next(words)
         self._boot_steps = [reset for reset in (next(words) for _ in range(RESETS_KEPT)) if reset >= 0]
         for part in (
             self._meals,

@@ -41,6 +41,13 @@ class Op(enum.IntEnum):
     RESUME_SCHEDULE = 3
 
 
+def accepted_limit(ack: dict[str, int], limit: int) -> int:
+    """The largest raw dose the pump accepts: a refusal lowers it, the answer to what was accepted may raise it."""
+    if ack["AckResult"] == OVER_LIMIT:
+        return ack["AckLimitRaw"]
+    return max(ack["AckLimitRaw"], limit) if ack["AckResult"] in (ACCEPTED, DUPLICATE) else limit
+
+
 class Pump:
     """Commands out, acknowledgements and totals in."""
 
@@ -90,12 +97,10 @@ class Pump:
         accepted = values["AckResult"] in (ACCEPTED, DUPLICATE)
         if values["AckFor"] == ACK_INSULIN_RATE:
             self.refused += not accepted
-            if values["AckResult"] == OVER_LIMIT:
-                self.rate_limit = values["AckLimitRaw"]
+            self.rate_limit = accepted_limit(values, self.rate_limit)
         elif values["AckFor"] == ACK_PRAM_RATE:
             self.refused += not accepted
-            if values["AckResult"] == OVER_LIMIT:
-                self.pram_rate_limit = values["AckLimitRaw"]
+            self.pram_rate_limit = accepted_limit(values, self.pram_rate_limit)
 
     def pramlintide(self, totals: dict[str, int] | None) -> int:
         """Pramlintide delivered since the last total, in 0.01 ug; to be called before `delivered`."""
@@ -157,7 +162,7 @@ class Pump:
         self._estimated = 0 if rebooted else max(estimated - delivered, 0)
         return max(delivered - estimated, 0)
 
-    def command(self, turn: Turn, op: Op, step: int, rate: int = 0, pramlintide_rate: int = 0) -> None:
+    def command(self, turn: Turn, op: Op, step: int, rate: int = 0, pramlintide_rate: int = 0) -> bool:
         """Send the set-point of this step, with a new number and an absolute expiry.
 
         Args:
@@ -167,8 +172,14 @@ class Pump:
             step: k.
             rate: 0.005 U/h.
             pramlintide_rate: 0.1 ug/h.
+
+        Returns:
+            Whether the pump's own limit has cut a rate.
         """
+        asked = rate, pramlintide_rate
         rate = min(rate, self.rate_limit)
+        if rate < asked[0]:
+            pramlintide_rate = pramlintide_rate * rate // asked[0]  # the ratio of the drugs stays
         pramlintide_rate = min(pramlintide_rate, self.pram_rate_limit)
         self._sequence = (self._sequence + 1) % SEQUENCES
         rates = {"InsulinRate": rate, "PramlintideRate": pramlintide_rate} if op == Op.SET_RATE else {}
@@ -180,6 +191,7 @@ class Pump:
             BasalUntilStep=(step + RATE_EXPIRES_AFTER) % 128,
             **rates,
         )
+        return (rate, pramlintide_rate) != asked
 
     def save(self) -> list[int]:
         """Words for the non-volatile memory; -1 stands for what is not known."""

@@ -216,6 +216,47 @@ def test_rates_stay_within_what_the_pump_last_accepted() -> None:
     assert bench.step(GLUCOSE + 450, also=[ack]).rate == 300
 
 
+def test_a_limit_of_the_pump_holds_until_the_pump_takes_it_back() -> None:
+    """And both drugs keep their ratio, down to nothing of either (requirements CMD-07, TWO-01, TWO-02)."""
+    bench = Bench(mode=S2)
+    bench.run(20, GLUCOSE + 400)
+    pump = bench.firmware._pump  # type: ignore[attr-defined]
+
+    def ack(result: int, limit: int) -> list:
+        echo = {"AckFor": 1, "AckId": pump._sequence, "AckEchoRaw": 0}
+        return [bench.frame("PUMP_Ack", AckResult=result, AckLimitRaw=limit, **echo)]
+
+    turn = bench.step(GLUCOSE + 450, also=ack(3, 0))
+    assert (turn.rate, turn.command["PramlintideRate"]) == (0, 0)
+    assert turn.status["LimiterBits"] & 1
+    turn = bench.step(GLUCOSE + 460, also=ack(0, 0))
+    assert turn.rate == 0
+    turn = bench.step(GLUCOSE + 470, also=ack(0, 200))
+    assert turn.rate == 200
+    assert abs(turn.command["PramlintideRate"] - 100) <= 1  # 10 ug/U
+    assert bench.step(GLUCOSE + 480, also=ack(0, 6000)).rate > 300
+
+
+def test_a_skipped_step_does_not_stop_insulin() -> None:
+    """What is caught up knows how much the day leaves (requirement TIM-02)."""
+    bench = Bench(mode=NMA)
+    bench.run(20, GLUCOSE + 100)
+    bench.k += 1
+    bench.total += bench.basal
+    assert bench.step(cgm=()).rate == bench.basal // 5
+
+
+def test_resuming_soon_after_a_confirmed_suspension_is_told() -> None:
+    bench = Bench(mode=NMA)
+    bench.run(5)
+    bench.send("MODE_Cmd", ModeRequest=NMA, ModeCmdSeq=1, SuspendRequest=1)
+    (alarm,) = bench.step().alarms(Code.STATE_CHANGE)
+    bench.send("UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"])
+    bench.step()
+    bench.send("MODE_Cmd", ModeRequest=NMA, ModeCmdSeq=2, SuspendRequest=2)
+    assert [alarm["CtrlAlarmState"] for alarm in bench.step().alarms(Code.STATE_CHANGE)] == [1]
+
+
 # ---- meals and days
 
 

@@ -85,6 +85,16 @@ def test_meals(last: int | None) -> None:
     assert again.take() == (0, 0)
 
 
+def test_what_is_not_known_is_minus_one_and_what_is_not_there_is_zero() -> None:
+    """The layout of the memory is read by tools too: what stands for nothing is fixed."""
+    assert Cgm().save() == [-1, -1, 255, 0, -1]
+    assert Meals().save() == [-1]
+    assert Pump().save() == [1022, -1, -1, -1, 0, -1]
+    assert Boluses().save() == [0] * 13
+    assert Alarms().save() == [0]
+    assert Calibration().save() == [0]
+
+
 def test_alarms_use_no_instance_twice() -> None:
     alarms = Alarms()
     alarms.hold(Code.CGM_LOST, True, 0)
