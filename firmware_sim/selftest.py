@@ -4,7 +4,7 @@ import binascii
 import enum
 from collections.abc import Mapping
 
-from .control import core, limits, observer, prandial
+from .control import core, lags, limits, observer, prandial
 from .control.fixed import Ints
 from .control.strategies import s1, s2, s3, s4
 
@@ -25,7 +25,7 @@ class Failure(enum.IntFlag):
 def program_crc() -> int:
     """CRC-32 over the code of the control path, as a boot loader takes it over its flash."""
     crc = 0
-    for module in (core, limits, observer, prandial, s1, s2, s3, s4):
+    for module in (core, lags, limits, observer, prandial, s1, s2, s3, s4):
         crc = _names_crc(vars(module), crc)
     return crc
 

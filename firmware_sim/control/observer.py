@@ -11,6 +11,7 @@ by Tustin's rule, divided by K_d. u is what the pump says it delivered above the
 anti-windup.
 """
 
+from . import lags
 from .fixed import Ints, round_divide, round_shift, saturate
 from .layout import (
     BASAL,
@@ -29,8 +30,6 @@ from .layout import (
     INSULIN_B3,
     INSULIN_GAIN,
     LAG_1,
-    LAG_2,
-    LAG_3,
     LEAD1_B0,
     LEAD1_B1,
     LEAD2_B0,
@@ -68,23 +67,18 @@ def insulin_effect(state: Ints, parameters: Ints, inputs: Ints) -> int:
     Returns:
         K_u x_3(k) in 0.1 mg/dL, 10 fractional bits.
     """
-    counts = state[SATURATIONS : SATURATIONS + 1]
-    x1 = state[LAG_1]
-    x2 = state[LAG_2]
-    x3 = state[LAG_3]
-    u = state[U_3]
     p = parameters
-    state[LAG_1] = saturate(round_shift(p[INSULIN_A11] * x1 + p[INSULIN_B1] * u, 30), counts)
-    state[LAG_2] = saturate(round_shift(p[INSULIN_A21] * x1 + p[INSULIN_A22] * x2 + p[INSULIN_B2] * u, 30), counts)
-    state[LAG_3] = saturate(
-        round_shift(p[INSULIN_A31] * x1 + p[INSULIN_A32] * x2 + p[INSULIN_A33] * x3 + p[INSULIN_B3] * u, 30),
-        counts,
-    )
+    lagged = lags.advance(
+        state, LAG_1, state[U_3],
+        p[INSULIN_A11], p[INSULIN_A21], p[INSULIN_A22], p[INSULIN_A31], p[INSULIN_A32], p[INSULIN_A33],
+        p[INSULIN_B1], p[INSULIN_B2], p[INSULIN_B3],
+    )  # fmt: skip
     state[U_3] = state[U_2]
     state[U_2] = state[U_1]
     state[U_1] = above_schedule(parameters, inputs, 14)
     # K_u in 0.001 mg/dL/(U/min), x_3 in mU per 5 min with 14 bits: / (1000 * 1000 * 5) * 10 and 4 bits less
-    effect = saturate(round_divide(parameters[INSULIN_GAIN] * state[LAG_3], 500000 * 16), counts)
+    counts = state[SATURATIONS : SATURATIONS + 1]
+    effect = saturate(round_divide(parameters[INSULIN_GAIN] * lagged, 500000 * 16), counts)
     state[SATURATIONS] = counts[0]
     return effect
 

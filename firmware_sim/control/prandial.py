@@ -5,7 +5,8 @@ mechanism (after Brosilow and Joseph 2002) takes the insulin that the bolus stan
 the same meal: u_I = gamma d - x F(s) e^(-15 s) u_B, where x is the share that is taken out.
 """
 
-from .fixed import Ints, round_divide, round_shift, saturate
+from . import lags
+from .fixed import Ints, round_divide, saturate
 from .layout import (
     ASSUMED_CARBS,
     BOLUS_1,
@@ -14,8 +15,6 @@ from .layout import (
     BOLUS_DEDUCTION,
     CARB_RATIO,
     FILTER_1,
-    FILTER_2,
-    FILTER_3,
     FILTER_A1,
     FILTER_A2,
     FILTER_A3,
@@ -47,22 +46,18 @@ def deduction(state: Ints, parameters: Ints, inputs: Ints) -> int:
     Returns:
         x F e^(-15 s) u_B in 0.005 U/h, 16 fractional bits.
     """
-    counts = state[SATURATIONS : SATURATIONS + 1]
-    x1 = state[FILTER_1]
-    x2 = state[FILTER_2]
-    x3 = state[FILTER_3]
-    u = state[BOLUS_3]
     p = parameters
-    state[FILTER_1] = saturate(round_shift(p[FILTER_A1] * x1 + p[FILTER_B1] * u, 30), counts)
-    state[FILTER_2] = saturate(round_shift(p[FILTER_A2] * x1 + p[FILTER_A1] * x2 + p[FILTER_B2] * u, 30), counts)
-    state[FILTER_3] = saturate(
-        round_shift(p[FILTER_A3] * x1 + p[FILTER_A2] * x2 + p[FILTER_A1] * x3 + p[FILTER_B3] * u, 30), counts
-    )
+    filtered = lags.advance(
+        state, FILTER_1, state[BOLUS_3],
+        p[FILTER_A1], p[FILTER_A2], p[FILTER_A1], p[FILTER_A3], p[FILTER_A2], p[FILTER_A1],
+        p[FILTER_B1], p[FILTER_B2], p[FILTER_B3],
+    )  # fmt: skip
     state[BOLUS_3] = state[BOLUS_2]
     state[BOLUS_2] = state[BOLUS_1]
     state[BOLUS_1] = inputs[IN_BOLUS] << 14
-    # x in 0.001, FILTER_3 in mU per 5 min with 14 bits; 12 steps in an hour, LSB 5 mU/h with 16 bits
-    taken = saturate(round_divide(p[BOLUS_DEDUCTION] * state[FILTER_3] * 48, 5000), counts)
+    # x in 0.001, what was filtered in mU per 5 min with 14 bits; 12 steps in an hour, LSB 5 mU/h with 16 bits
+    counts = state[SATURATIONS : SATURATIONS + 1]
+    taken = saturate(round_divide(p[BOLUS_DEDUCTION] * filtered * 48, 5000), counts)
     state[SATURATIONS] = counts[0]
     return taken
 
