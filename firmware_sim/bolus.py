@@ -204,13 +204,7 @@ class Boluses:
     def _must_wait(self, drug: Drug, bolus: _Bolus) -> bool:
         """Pramlintide of a meal is not committed before its insulin is agreed: a meal is refused as a whole."""
         insulin = self._open.get(Drug.INSULIN)
-        return (
-            drug == Drug.PRAMLINTIDE
-            and bolus.op == Op.COMMIT
-            and insulin is not None
-            and insulin.until == bolus.until
-            and insulin.op == Op.PROGRAM
-        )
+        return drug == Drug.PRAMLINTIDE and bolus.op == Op.COMMIT and insulin is not None and insulin.op == Op.PROGRAM
 
     def listen(self) -> None:
         """Go on by the acknowledgements that came since `speak`."""

@@ -144,17 +144,18 @@ def test_every_coefficient_of_the_filter_is_used(word: str, late: int) -> None:
 
 def bolus(wanted: int = 500, *, flash: dict[str, int] | None = None, memory: dict[str, int] | None = None, **told: int):
     """Dose and limiter bits."""
-    words_out = outputs(OUT_IOB=told.pop("iob", 0))
+    words_out = outputs(OUT_IOB=told.pop("iob", 0), OUT_LIMITERS=256)  # a bit that is there stays there
     kept = state(**memory or {})
     flashed = parameters(BOLUS_LOCKOUT=3, LOW_SUSPEND=700, **flash or {})
     dose = limits.limit_bolus(wanted, kept, flashed, inputs(**told), words_out)
-    return dose, words_out[layout.OUT_LIMITERS], kept[layout.BOLUS_WAIT]
+    return dose, words_out[layout.OUT_LIMITERS] - 256, kept[layout.BOLUS_WAIT]
 
 
 @pytest.mark.parametrize(
     ("case", "expected"),
     [
         ({}, (500, 0, 3)),
+        ({"wanted": 1}, (1, 0, 3)),
         ({"wanted": 1000}, (1000, 0, 3)),
         ({"wanted": 1001}, (1000, 2, 3)),
         ({"iob": 1500}, (500, 0, 3)),
@@ -181,11 +182,11 @@ def test_what_cuts_a_bolus(case: dict, expected: tuple[int, int, int]) -> None:
 
 
 def pram_bolus(wanted: int = 150, *, memory: dict[str, int] | None = None, **told: int) -> tuple[int, int, int]:
-    words_out = outputs()
+    words_out = outputs(OUT_LIMITERS=256)
     kept = state(**{"GLUCOSE": 1200} | (memory or {}))
-    flashed = parameters(BOLUS_LOCKOUT=3)
+    flashed = parameters(BOLUS_LOCKOUT=3, LOW_SUSPEND=650)
     dose = limits.limit_pram_bolus(wanted, kept, flashed, inputs(**told), words_out)
-    return dose, words_out[layout.OUT_LIMITERS], kept[layout.PRAM_WAIT]
+    return dose, words_out[layout.OUT_LIMITERS] - 256, kept[layout.PRAM_WAIT]
 
 
 @pytest.mark.parametrize(
@@ -193,6 +194,10 @@ def pram_bolus(wanted: int = 150, *, memory: dict[str, int] | None = None, **tol
     [
         ({}, (150, 0, 3)),
         ({"wanted": 0}, (0, 0, 0)),
+        ({"wanted": 1}, (1, 0, 3)),
+        ({"IN_GLUCOSE": 649}, (0, 8, 0)),
+        ({"IN_GLUCOSE": 650}, (150, 0, 3)),
+        ({"memory": {"GLUCOSE": 780, "GLUCOSE_1": 840, "GLUCOSE_2": 900, "TREND": 3}}, (0, 8, 0)),
         ({"wanted": 300}, (300, 0, 3)),
         ({"wanted": 301}, (300, 2, 3)),
         ({"IN_PRAM_LEFT": 150}, (150, 0, 3)),
@@ -227,9 +232,9 @@ def test_what_cuts_a_pramlintide_bolus(case: dict, expected: tuple[int, int, int
     ],
 )
 def test_what_cuts_a_pramlintide_rate(wanted: int, given: int, told: dict[str, int], rate: int, bits: int) -> None:
-    words_out = outputs()
+    words_out = outputs(OUT_LIMITERS=256)
     assert limits.limit_pram_rate(wanted, given, inputs(**told), words_out) == rate
-    assert words_out[layout.OUT_LIMITERS] == bits
+    assert words_out[layout.OUT_LIMITERS] - 256 == bits
 
 
 # ---- limits of the rate
@@ -241,11 +246,11 @@ def rate(demand: int, dose: int = 0, *, memory: dict[str, int] | None = None, io
     for name in list(values):
         if not name.startswith("IN_"):
             flashed[name] = values.pop(name)
-    words_out = outputs(OUT_IOB=iob)
+    words_out = outputs(OUT_IOB=iob, OUT_LIMITERS=256)
     kept = state(**memory or {})
     given = limits.limit_rate(demand << 16, dose, kept, parameters(**flashed), inputs(**values), words_out)
     assert given == kept[layout.RATE]
-    return given, words_out[layout.OUT_LIMITERS]
+    return given, words_out[layout.OUT_LIMITERS] - 256
 
 
 @pytest.mark.parametrize(
