@@ -1,13 +1,17 @@
 """The firmware as a process: `python -m firmware_sim --bus URL`.
 
 It waits for the bench's roll call, does one run, and ends with it.
+
+With `--console` a thread serves the serial port. It shares no lock with the control loop: it reads the copies that the
+loop leaves behind after each turn, and takes bytes no faster than a UART does, so that a flood costs the loop little
+CPU and no frame. A console that fails ends alone, with one line on stderr; the run goes on.
 """
 
 import argparse
 import os
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from can_bus.codec import message
@@ -15,12 +19,15 @@ from can_bus.frame import Frame
 from can_bus.process import exit_status
 from can_bus.url import open_link
 
-from .console import Console, Pairs
+from .console import Console, FirmwareView
 from .firmware import NVM_WORDS, Cause, Firmware, subscriptions
 from .nvm import FileMemory, NvmError, memory_size
 from .serial_port import PortError, SerialPort
 
 POLL_SECONDS = 0.05
+
+BYTES_PER_SECOND = 11520
+"""Of the console: 115200 baud."""
 
 
 def memory(path: Path) -> FileMemory:
@@ -33,41 +40,39 @@ def memory(path: Path) -> FileMemory:
     return FileMemory(str(path), memory_size(NVM_WORDS), opener=lambda name, flags: os.open(name, flags, 0o600))
 
 
-class _Live:
-    """The device that runs now, as the console sees it: a reset replaces it."""
-
-    def __init__(self, firmware: Firmware) -> None:
-        self.firmware = firmware
-        self.console = Console(self)
-        self.firmware.log = self.console.log
-
-    def restart(self, nvm: FileMemory) -> list[Frame]:
-        """A software reset; what the device then says by itself."""
-        self.firmware = Firmware(nvm, Cause.SOFTWARE)
-        self.firmware.log = self.console.log
-        return self.firmware.start()
-
-    def status(self) -> Pairs:
-        return self.firmware.status()
-
-    def parameters(self) -> dict[str, int]:
-        return self.firmware.parameters()
-
-    def faults(self) -> Iterable[Pairs]:
-        return self.firmware.faults()
-
-    def version(self) -> Pairs:
-        return self.firmware.version()
-
-    def request_reset(self) -> bool:
-        return self.firmware.request_reset()
-
-
 def attend(port: SerialPort, console: Console, over: threading.Event) -> None:
     """Serve the console until the run is over: a thread of its own, which the control loop never waits for."""
-    while not over.is_set():
-        port.wait(POLL_SECONDS)
-        port.write(console.feed(port.read()))
+    try:
+        while not over.is_set():
+            port.wait(POLL_SECONDS)
+            data = port.read()
+            console.unsent = port.dropped
+            port.write(console.feed(data))
+            over.wait(len(data) / BYTES_PER_SECOND)
+    except OSError as error:
+        print(f"firmware_sim: the console is gone: {error}", file=sys.stderr)
+
+
+class _Attended:
+    """The console of the device that runs now, and its thread."""
+
+    def __init__(self, firmware: Firmware, port: SerialPort) -> None:
+        self.view = FirmwareView(firmware)
+        self._console = Console(self.view)
+        self.view.log = firmware.log = self._console.log
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=attend, args=(port, self._console, self._over), daemon=True)
+        self._thread.start()
+
+    def replace(self, firmware: Firmware) -> None:
+        """The device after a reset."""
+        firmware.log = self._console.log
+        self.view.replace(firmware)
+
+    def close(self) -> None:
+        """End the thread before its port is closed, whose descriptor may soon be another file's."""
+        self._over.set()
+        self._thread.join(1)
 
 
 def serve(
@@ -85,26 +90,30 @@ def serve(
         BusUrlError: the URL names no bus.
         BusLost: the bus went away or lost frames.
     """
-    live = _Live(Firmware(nvm, cause))
+    firmware = Firmware(nvm, cause)
     token = message("SYNC_Step").can_id
-    over = threading.Event()
-    if port is not None:
-        threading.Thread(target=attend, args=(port, live.console, over), daemon=True).start()
+    attended = None if port is None else _Attended(firmware, port)
     try:
         with open_link(url, filters=[message(name).can_id for name in subscriptions()]) as link:
-            boot = live.firmware.start()
+            boot = firmware.start()
             if boot:
                 link.send(boot)
-            while not live.firmware.finished:
+            while not firmware.finished:
                 for frame in link.recv(None):
-                    if live.firmware.reset_requested and frame.can_id == token and nvm is not None:
-                        answer: Sequence[Frame] = live.restart(nvm)  # this token is lost, as in any reset
+                    if firmware.reset_requested and frame.can_id == token and nvm is not None:
+                        firmware = Firmware(nvm, Cause.SOFTWARE)
+                        if attended is not None:
+                            attended.replace(firmware)
+                        answer: Sequence[Frame] = firmware.start()  # this token is lost, as in any reset
                     else:
-                        answer = live.firmware.receive(frame)
+                        answer = firmware.receive(frame)
                     if answer:
                         link.send(answer)
+                        if attended is not None:
+                            attended.view.publish()  # behind the answer: nobody on the bus waits for it
     finally:
-        over.set()
+        if attended is not None:
+            attended.close()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

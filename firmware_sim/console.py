@@ -14,6 +14,9 @@ LINE_MAX = 128
 LOG_LINES = 256
 """Log lines that wait for a reader; older ones are dropped and counted, for nothing here may ever wait."""
 
+CLEAR_LINE = b"\r\x1b[K"
+"""Wipes the prompt and what was typed behind it, before a log line takes their place."""
+
 LEVELS = ("off", "error", "warn", "info", "debug")
 
 ERR_UNKNOWN, ERR_USAGE, ERR_READ_ONLY, ERR_LINE, ERR_REFUSED = 1, 2, 3, 4, 5
@@ -24,6 +27,7 @@ HELP = (
     ("get [NAME]", "a calibration parameter as stored, raw; without a name all of them"),
     ("set NAME=VALUE", "a setting of the console: echo=on|off, log=LEVEL; nothing else can be set"),
     ("log LEVEL", "log lines to show: " + " ".join(LEVELS)),
+    ("echo on|off", "echo and prompt; off is the mode for machines"),
     ("version", "of the firmware and of the protocol"),
     ("faults", "alarms in force, highest first"),
     ("reset", "restart from the non-volatile memory after this turn"),
@@ -51,6 +55,64 @@ class Device(Protocol):
         """Ask for a restart at the end of the turn; False: this device has no memory to restart from."""
 
 
+class FirmwareView:
+    """A device as the console's thread sees it: copies that the control loop leaves behind after a turn.
+
+    The device's own dictionaries change while another thread would walk through them, and a status read in the middle
+    of a step would mix two steps. A whole copy is put in place by one assignment, so neither side ever waits.
+
+    Attributes:
+        log: takes a line for every alarm that begins, changes or ends.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.log: Callable[[str, int, str, str], None] = lambda _level, _seconds, _module, _text: None
+        self._seen: dict[int | str, int | str] = {}
+        self._version = dict(device.version())
+        self.replace(device)
+
+    def replace(self, device: Device) -> None:
+        """Show another device, the one after a reset."""
+        self._device = device
+        self._seen.clear()  # its alarms begin anew
+        self.publish()
+
+    def publish(self) -> None:
+        """Copy what the device says now; only ever called by the thread that runs the device."""
+        status = dict(self._device.status())
+        faults = tuple(dict(fault) for fault in self._device.faults())
+        self._snapshot = status, dict(self._device.parameters()), faults
+        seen = {fault["code"]: fault["state"] for fault in faults}
+        if seen != self._seen:
+            seconds = int(status["time"])
+            for code in self._seen.keys() - seen.keys():
+                self.log("info", seconds, "alarm", f"{code} over")
+            for fault in faults:
+                if self._seen.get(fault["code"]) != fault["state"]:
+                    self.log("warn", seconds, "alarm", f"{fault['code']} {fault['state']}")
+        self._seen = seen
+
+    def status(self) -> Pairs:
+        """Of the newest whole step."""
+        return self._snapshot[0]
+
+    def parameters(self) -> Mapping[str, int]:
+        """The calibration in force after that step."""
+        return self._snapshot[1]
+
+    def faults(self) -> Iterable[Pairs]:
+        """Alarms in force after that step."""
+        return self._snapshot[2]
+
+    def version(self) -> Pairs:
+        """Of firmware and protocol."""
+        return self._version
+
+    def request_reset(self) -> bool:
+        """Ask the device itself; it is one assignment there."""
+        return self._device.request_reset()
+
+
 class _Refused(Exception):
     def __init__(self, number: int, reason: str) -> None:
         self.number = number
@@ -64,10 +126,10 @@ def pairs(values: Pairs) -> str:
 
 
 class Console:
-    """One session on one port.
+    """One session on one port. `log` may be called by another thread than everything else.
 
     Attributes:
-        dropped: log lines that nobody read in time.
+        unsent: bytes that the port had to drop, as told by whoever moves them.
     """
 
     def __init__(self, device: Device) -> None:
@@ -77,14 +139,19 @@ class Console:
         self._last = 0  # byte before, so that CR LF is one line end
         self._echo = True
         self._level = LEVELS.index("off")
-        self._log: deque[str] = deque()
-        self.dropped = 0
+        self._prompted = False  # the cursor stands behind a prompt
+        # one thread appends, the other takes: a full deque drops its oldest by itself, so that neither can fail
+        self._log: deque[str] = deque(maxlen=LOG_LINES)
+        self._offered = 0  # counted by the thread that logs
+        self._taken = 0  # counted by the thread that reads
+        self.unsent = 0
         self._commands: dict[str, Callable[[str], list[str]]] = {
             "help": self._help,
             "status": self._status,
             "get": self._get,
             "set": self._set,
             "log": self._set_level,
+            "echo": self._set_echo,
             "version": self._version,
             "faults": self._faults,
             "reset": self._reset,
@@ -92,18 +159,19 @@ class Console:
 
     def log(self, level: str, seconds: int, module: str, text: str) -> None:
         """Offer a log line, stamped with simulated time; it waits for the next `feed` or is dropped."""
-        if not 0 < LEVELS.index(level) <= self._level:
+        if level not in LEVELS[1 : self._level + 1]:
             return
-        if len(self._log) == LOG_LINES:
-            self._log.popleft()
-            self.dropped += 1
         self._log.append(f"{level[0].upper()} ({seconds}) {module}: {text}")
+        self._offered += 1  # after the line itself, or it would look dropped for a moment
+
+    @property
+    def dropped(self) -> int:
+        """Log lines that nobody read in time."""
+        return max(self._offered - self._taken - len(self._log), 0)
 
     def feed(self, data: bytes) -> bytes:
         """Take what was typed, any bytes; what is to be shown, waiting log lines first."""
-        out = bytearray()
-        while self._log:
-            out += self._log.popleft().encode("ascii", "replace") + b"\r\n"
+        out = bytearray(self._log_lines())
         for byte in data:
             if byte in b"\r\n":
                 if not (byte == 10 and self._last == 13):
@@ -120,6 +188,17 @@ class Console:
             self._last = byte
         return bytes(out)
 
+    def _log_lines(self) -> bytes:
+        """The log lines that wait; they take the place of the prompt, which comes back below them."""
+        lines = [self._log.popleft() for _ in range(len(self._log))]
+        if not lines:
+            return b""
+        self._taken += len(lines)
+        out = b"".join(text.encode("ascii", "replace") + b"\r\n" for text in lines)
+        if not self._prompted:
+            return out
+        return CLEAR_LINE + out + b"> " + bytes(byte for byte in self._line if 32 <= byte < 127)
+
     def _end_of_line(self) -> bytes:
         line, overlong = bytes(self._line), self._overlong
         self._line.clear()
@@ -127,7 +206,8 @@ class Console:
         lines = self._answer(line, overlong)
         out = b"\r\n" if self._echo else b""
         out += b"".join(text.encode("ascii", "replace") + b"\r\n" for text in lines)
-        return out + (b"> " if self._echo else b"")
+        self._prompted = self._echo
+        return out + (b"> " if self._prompted else b"")
 
     def _answer(self, line: bytes, overlong: bool) -> list[str]:
         try:
@@ -157,7 +237,7 @@ class Console:
 
     def _status(self, rest: str) -> list[str]:
         self._nothing(rest, "status")
-        return [pairs({**self._device.status(), "dropped": self.dropped})]
+        return [pairs({**self._device.status(), "dropped": self.dropped, "unsent": self.unsent})]
 
     def _get(self, rest: str) -> list[str]:
         parameters = self._device.parameters()
@@ -175,9 +255,12 @@ class Console:
             return self._set_level(value)
         if name != "echo":
             raise _Refused(ERR_READ_ONLY, "only echo and log can be set here, nothing that doses")
-        if value not in ("on", "off"):
-            raise _Refused(ERR_USAGE, "usage: set echo=on|off")
-        self._echo = value == "on"
+        return self._set_echo(value)
+
+    def _set_echo(self, rest: str) -> list[str]:
+        if rest not in ("on", "off"):
+            raise _Refused(ERR_USAGE, "usage: echo on|off")
+        self._echo = rest == "on"
         return []
 
     def _set_level(self, rest: str) -> list[str]:

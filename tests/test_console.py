@@ -1,6 +1,11 @@
 """The serial console: what it answers, that it never waits, and that it changes no frame."""
 
+import itertools
+import json
+import os
 import random
+import re
+import socket
 import subprocess
 import sys
 import threading
@@ -13,11 +18,14 @@ from bench import S2, Bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from can_bus.codec import Transmitter
+from can_bus.lockstep import Turn
 from firmware_sim.__main__ import attend
-from firmware_sim.console import LINE_MAX, LOG_LINES, Console
+from firmware_sim.alarms import Alarms, Code
+from firmware_sim.console import LINE_MAX, LOG_LINES, Console, FirmwareView
 from firmware_sim.firmware import NVM_WORDS, Firmware
 from firmware_sim.nvm import RamMemory, memory_size
-from firmware_sim.serial_port import PortError, SerialPort
+from firmware_sim.serial_port import PENDING_MAX, PortError, SerialPort
 
 
 def say(console: Console, *lines: str) -> list[str]:
@@ -57,7 +65,7 @@ def test_parameters_can_be_read_and_not_written(bench: Bench) -> None:
         ("bolus 10", ["ERR 1 no such command, see help"]),
         ("get Nothing", ["ERR 2 no such parameter is stored, get lists them"]),
         ("set echo", ["ERR 2 usage: set NAME=VALUE"]),
-        ("set echo=maybe", ["ERR 2 usage: set echo=on|off"]),
+        ("set echo=maybe", ["ERR 2 usage: echo on|off"]),
         ("log loud", ["ERR 2 usage: log off|error|warn|info|debug"]),
         ("status now", ["ERR 2 usage: status"]),
         ("reset", ["ERR 5 there is no non-volatile memory to restart from"]),
@@ -74,7 +82,7 @@ def test_version_and_help_and_prompt(bench: Bench) -> None:
     console = Console(bench.firmware)  # type: ignore[arg-type]
     assert console.feed(b"version\n").startswith(b"version\r\nfirmware=0.2 protocol=1.1 dbc_crc=")
     assert console.feed(b"\r\n").endswith(b"> ")
-    assert console.feed(b"helq\x7fp\r").count(b"\r\n") == 10
+    assert console.feed(b"helq\x7fp\r").count(b"\r\n") == 11
 
 
 def test_log_lines_have_simulated_time_and_the_oldest_are_dropped(bench: Bench) -> None:
@@ -119,21 +127,112 @@ def test_a_reset_is_asked_for_where_there_is_a_memory() -> None:
     assert firmware.reset_requested
 
 
+def test_a_log_line_takes_the_place_of_the_prompt_and_of_what_is_being_typed(bench: Bench) -> None:
+    console = Console(bench.firmware)  # type: ignore[arg-type]
+    assert console.feed(b"log info\rsta").endswith(b"OK\r\n> sta")
+    console.log("info", 300, "ladder", "AUTO -> DEGRADED")
+    assert console.feed(b"") == b"\r\x1b[KI (300) ladder: AUTO -> DEGRADED\r\n> sta"
+    assert console.feed(b"tus\r").startswith(b"tus\r\nstep=")
+    assert console.feed(b"echo off\r").endswith(b"OK\r\n")
+    console.log("info", 600, "ladder", "DEGRADED -> AUTO")
+    assert console.feed(b"") == b"I (600) ladder: DEGRADED -> AUTO\r\n"
+
+
+def test_the_view_shows_whole_steps_and_logs_what_becomes_of_an_alarm(bench: Bench) -> None:
+    firmware = bench.firmware
+    assert isinstance(firmware, Firmware)
+    view = FirmwareView(firmware)
+    lines: list[tuple[str, int, str, str]] = []
+    view.log = lambda *line: lines.append(line)
+    held = (view.status(), view.parameters(), view.faults())
+    kept = [dict(held[0]), dict(held[1]), list(held[2])]
+    for _ in range(4):
+        before = view.status()
+        bench.step(1200, drop=True)
+        assert view.status() is before
+        view.publish()
+    assert [dict(held[0]), dict(held[1]), list(held[2])] == kept
+    assert view.status()["step"] == 9
+    assert ("warn", 2700, "alarm", "cgm_lost pending") in lines
+    for _ in range(12):
+        bench.step(1200)
+        view.publish()
+    assert [line[3] for line in lines if line[2] == "alarm" and line[3].startswith("cgm_lost")][-1] == "cgm_lost over"
+
+
+def test_alarms_that_change_in_another_thread_can_be_listed() -> None:
+    """The device's own listing cannot: it fails when an alarm ends half-way."""
+    alarms = Alarms()
+    turn = Turn(Transmitter())
+    device = Firmware()
+    device._alarms = alarms
+    view = FirmwareView(device)
+    console = Console(view)
+    console.feed(b"echo off\r")
+    over = threading.Event()
+    replies: set[bytes] = set()
+
+    def look() -> None:
+        while not over.is_set():
+            replies.add(console.feed(b"faults\r")[-4:])
+
+    reader = threading.Thread(target=look)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        reader.start()
+        end = time.monotonic() + 1
+        for k in itertools.count():
+            for code in Code:
+                alarms.hold(code, k // 8 % 2 == 0, k)
+            alarms.report(turn)
+            turn.take()
+            view.publish()
+            if time.monotonic() > end:
+                break
+        assert reader.is_alive()
+    finally:
+        over.set()
+        reader.join()
+        sys.setswitchinterval(interval)
+    assert replies == {b"OK\r\n"}
+
+
 # ---- ports
 
 
 def test_a_pseudo_terminal_that_nobody_reads_never_blocks(tmp_path: Path) -> None:
     port = SerialPort(f"pty:{tmp_path / 'tty'}")
+    line = b"I (0) flood: nobody reads this line\r\n"
     for _ in range(20000):
-        port.write(b"I (0) flood: nobody reads this line\r\n")
+        port.write(line)
+    assert 0 < 20000 * len(line) - port.dropped <= PENDING_MAX + 65536
+    with serial.serial_for_url(port.name, timeout=0.1) as tty:  # what is read later is whole lines
+        got = b""
+        while len(got) < 20000:
+            port.write(b"")
+            got += tty.read(4096)
+    assert got[got.index(b"\n") + 1 :].startswith(line * 3)
     port.close()
-    assert not (tmp_path / "tty").exists()
+    assert not (tmp_path / "tty").is_symlink()
 
 
-@pytest.mark.parametrize("name", ["/dev/nothing-here", "socket://10.0.0.1:99", "nonsense://x"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/dev/nothing-here",
+        "socket://10.0.0.1:99",
+        "SOCKET://10.0.0.1:99",
+        "socket://127.0.0.1:80@10.0.0.1:99",
+        "socket://localhost.example:99",
+        "rfc2217://10.0.0.1:99",
+        "nonsense://x",
+    ],
+)
 def test_a_port_that_cannot_be_had_is_named(name: str) -> None:
-    with pytest.raises(PortError, match=name):
+    with pytest.raises(PortError, match=re.escape(name)) as caught:
         SerialPort(name)
+    assert ("on the loopback" in str(caught.value)) == ("socket" in name.lower() or "rfc2217" in name)
 
 
 def test_a_link_that_exists_is_not_replaced(tmp_path: Path) -> None:
@@ -141,6 +240,74 @@ def test_a_link_that_exists_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(PortError, match="does not exist yet"):
         SerialPort(f"pty:{tmp_path / 'tty'}")
     assert (tmp_path / "tty").read_text() == "mine"
+
+
+def test_the_link_of_a_firmware_that_was_killed_is_replaced(tmp_path: Path) -> None:
+    link = tmp_path / "tty"
+    link.symlink_to("/dev/pts/987654")
+    port = SerialPort(f"pty:{link}")
+    assert str(link.readlink()) == port.name
+    with pytest.raises(PortError, match="does not exist yet"):  # but not that of one that lives
+        SerialPort(f"pty:{link}")
+    assert str(link.readlink()) == port.name
+    port.close()
+
+
+# pyserial forgets to close a socket whose other end is gone
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_socket_that_nobody_reads_does_not_block_and_its_end_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        there, _ = server.accept()
+        begin = time.process_time()
+        for _ in range(20000):
+            port.write(b"x" * 1022 + b"\r\n")
+        assert port.dropped > 1000000
+        assert time.process_time() - begin < 5
+        there.close()
+        attend(port, Console(Firmware()), threading.Event())
+    port.close()
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("firmware_sim: the console is gone: socket://127.0.0.1:")
+
+
+def run_folder_sha256(out: Path, *options: str) -> str:
+    base = ["--strategy", "s3", "--days", "2", "--seed", "5", "--out", str(out)]
+    done = subprocess.run([sys.executable, "-m", "pumpbench", "run", *base, *options], check=False, timeout=200)
+    assert done.returncode == 0
+    return str(json.loads((out / "run.json").read_text(encoding="utf-8"))["trace_sha256"])
+
+
+def test_a_flooded_console_changes_no_frame_of_a_run_between_processes(tmp_path: Path) -> None:
+    quiet = run_folder_sha256(tmp_path / "quiet")
+    link = tmp_path / "tty"
+    over = threading.Event()
+    typed = 0
+
+    def flood() -> None:
+        nonlocal typed
+        draw = random.Random(7)
+        tty = None
+        while not over.is_set():
+            try:
+                if tty is None:
+                    tty = os.open(link, os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+                typed += os.write(tty, draw.randbytes(100) + b"\rlog debug\rget\rset CfgMaxBasal=60000\rreset\r")
+            except OSError:  # not there yet, full, or gone
+                time.sleep(0.01)
+        if tty is not None:
+            os.close(tty)
+
+    flooder = threading.Thread(target=flood)
+    flooder.start()
+    try:
+        command = f"{sys.executable} -m firmware_sim --bus {{bus}} --console pty:{link}"
+        noisy = run_folder_sha256(tmp_path / "noisy", "--firmware", command)
+    finally:
+        over.set()
+        flooder.join()
+    assert typed > 1000
+    assert noisy == quiet
 
 
 def test_the_console_of_a_running_firmware(tmp_path: Path) -> None:
@@ -190,13 +357,52 @@ def test_the_console_of_a_running_firmware(tmp_path: Path) -> None:
 # ---- pumpbench console
 
 
+def test_a_backlog_of_log_lines_does_not_swallow_the_reply(bench: Bench, tmp_path: Path) -> None:
+    with Answering(bench.firmware, tmp_path / "tty") as answering:  # type: ignore[arg-type]
+        assert run_console(str(tmp_path / "tty"), "--command", "log info")[0] == 0
+        for k in range(LOG_LINES):
+            answering.console.log("info", 300 * k, "ladder", "a line as long as those of a busy device are")
+        time.sleep(0.3)  # they go out to nobody
+        status, out, _ = run_console(str(tmp_path / "tty"), "--command", "status\nversion")
+    assert status == 0
+    assert "firmware=0.2" in out and out.count("OK\n") == 2
+
+
+def test_by_hand_at_a_terminal(bench: Bench, tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    with Answering(bench.firmware, tmp_path / "tty"):  # type: ignore[arg-type]
+        command = [sys.executable, "-m", "pumpbench", "console", str(tmp_path / "tty")]
+        with subprocess.Popen(command, stdin=slave, stdout=subprocess.PIPE) as process:
+            os.write(master, b"get CfgBasal\n\x04")
+            out, _ = process.communicate(timeout=60)
+    os.close(master)
+    os.close(slave)
+    assert process.returncode == 0
+    assert out.replace(b"\r", b"") == b"CfgBasal=1425\nOK\n"
+
+
+def test_a_device_that_goes_away_ends_the_session(bench: Bench, tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        command = [sys.executable, "-m", "pumpbench", "console", port]
+        with subprocess.Popen(command, stdin=slave, stderr=subprocess.PIPE, text=True) as process:
+            server.accept()[0].close()
+            _, err = process.communicate(timeout=60)
+    os.close(master)
+    os.close(slave)
+    assert process.returncode == 3
+    assert err.startswith("pumpbench: socket://") and err.count("\n") == 1
+
+
 class Answering:
     """A console behind a pseudo terminal, served by a thread."""
 
     def __init__(self, firmware: Firmware, link: Path) -> None:
         self.port = SerialPort(f"pty:{link}")
         self.over = threading.Event()
-        self.thread = threading.Thread(target=attend, args=(self.port, Console(firmware), self.over), daemon=True)
+        self.console = Console(firmware)
+        self.thread = threading.Thread(target=attend, args=(self.port, self.console, self.over), daemon=True)
 
     def __enter__(self) -> "Answering":
         self.thread.start()
