@@ -144,7 +144,7 @@ class SerialPort:
         """How many bytes the port has taken."""
         descriptor = self.fileno()
         if descriptor >= 0:
-            return os.write(descriptor, data) if select.select([], [descriptor], [], 0)[1] else 0
+            return os.write(descriptor, data)  # non-blocking: pyserial opens devices and sockets so too
         self._serial.write(data)  # type: ignore[union-attr]
         return len(data)
 

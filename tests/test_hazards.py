@@ -22,7 +22,7 @@ from plant_server.server import PlantServer, Run
 Tamper = Callable[[str, dict[str, int], int], bool]
 """Message name, its values, step -> whether the frame gets lost on its way to the device."""
 
-COUNTED = ("H1", "H2", "H3", "H4", "H5", "H6", "H7")
+COUNTED = ("H1", "H2", "H3", "H4", "H5", "H6", "H7", "H8")
 
 
 def keep(_name: str, _values: dict[str, int], _step: int) -> bool:
@@ -614,4 +614,64 @@ def test_the_safety_part_repeats_the_devices_own_counts() -> None:
     assert safety["e2e_errors"] == safety["sequence_errors"] == safety["saturations"] == 0
     assert safety["ledger"] == {"closes": True}
     # what this bench cannot yet observe is not known, which is not the same as none
-    assert safety["hazards"] == {"H8": None} | none_but()
+    assert safety["hazards"] == none_but()
+
+
+# ---- H8: state lost over a reset
+
+
+class Restarting:
+    """A device that says something, starts anew, and says something else."""
+
+    def __init__(self) -> None:
+        self.monitor = Monitor()
+        self.plant, self.device = codec.Transmitter(), codec.Transmitter()
+        self.step = -1
+
+    def says(self, *, mode: int = 3, iob: int = 400, meal: int = 7) -> None:
+        self.step += 1
+        token = self.plant.frame("SYNC_Step", SyncPhase=Phase.STEP, StepIndex=self.step, SimTime=self.step * 300)
+        status = {"CtrlMode": mode, "CtrlState": 1, "InsulinOnBoard": iob, "LimiterBits": 0, "LastMealId": meal}
+        self.monitor.watch([token, self.device.frame("CTRL_Status", **status)])
+
+    def boots(self) -> None:
+        self.device = codec.Transmitter()
+        boot = self.device.frame("HB_CTRL", NmtCtrl=0, ToggleCtrl=0, ResetCauseCtrl=1, BootCtrl=1)
+        self.monitor.watch([boot])
+
+    @property
+    def lost(self) -> int:
+        return self.monitor.hazards["H8"]
+
+
+@pytest.mark.parametrize(
+    ("after", "lost"),
+    [
+        ({}, 0),
+        ({"mode": 0}, 1),
+        ({"iob": 251}, 0),
+        ({"iob": 249}, 1),
+        ({"iob": 0}, 1),
+        ({"meal": 8}, 0),
+        ({"meal": 6}, 1),
+        ({"meal": 255}, 1),
+    ],
+)
+def test_h8_what_a_device_forgets_over_a_reset(after: dict[str, int], lost: int) -> None:
+    bus = Restarting()
+    bus.says()
+    bus.boots()
+    bus.says(**after)
+    bus.says(**after)
+    assert bus.lost == lost
+
+
+def test_without_a_reset_nothing_is_lost_and_a_mode_that_was_asked_for_is_none() -> None:
+    bus = Restarting()
+    bus.says()
+    bus.says(mode=2, iob=0, meal=255)
+    assert bus.lost == 0
+    bus.boots()
+    bus.monitor.watch([bus.plant.frame("MODE_Cmd", ModeRequest=4, ModeCmdSeq=1, SuspendRequest=0)])
+    bus.says(mode=4, iob=0, meal=255)
+    assert bus.lost == 0

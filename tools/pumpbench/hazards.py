@@ -16,7 +16,12 @@ from plant_server import mechanism
 WATCHED = (
     "SYNC_Step", "SYNC_Done", "CGM_Reading", "PUMP_BasalCmd", "PUMP_Delivered", "CTRL_Status", "CTRL_Alarm",
     "CTRL_Diag", "CFG_Param", "PLANT_Truth", "FAULT_Inject", "PUMP_BolusCmd", "PUMP_Ack", "PUMP_BolusState", "HB_CTRL",
+    "MODE_Cmd",
 )  # fmt: skip
+
+MEAL_IDS, MEAL_SNA = 255, 255
+IOB_KEPT, IOB_SLACK = 0.75, 50.0
+"""Share of the insulin on board that is left after a step, and 0.01 U besides: no insulin in use fades faster (H8)."""
 
 USABLE_STATES = (1, 4, 5)
 AGE_RAISE = 3
@@ -165,6 +170,40 @@ class _BolusWatch:
         self._resolved = False
 
 
+class _ResetWatch:
+    """H8: what the device said of itself before a reset against what it says after it."""
+
+    def __init__(self, hazards: dict[str, int]) -> None:
+        self._hazards = hazards
+        self._before: dict[str, int] | None = None  # the newest status
+        self._step = -1  # of that status
+        self._booted = False
+        self._mode_asked = False  # since that status: then another mode is no loss
+
+    def boot(self) -> None:
+        """The device has started anew in the middle of a run."""
+        self._booted = True
+
+    def mode(self) -> None:
+        """A mode was asked for."""
+        self._mode_asked = True
+
+    def status(self, values: dict[str, int], step: int) -> None:
+        """A CTRL_Status of instant `step`."""
+        if self._booted and self._before is not None:
+            self._hazards["H8"] += self._lost(self._before, values, step - self._step)
+        self._before, self._step = values, step
+        self._booted = self._mode_asked = False
+
+    def _lost(self, before: dict[str, int], after: dict[str, int], steps: int) -> bool:
+        mode = before["CtrlMode"] != after["CtrlMode"] and not self._mode_asked
+        meal = before["LastMealId"] != MEAL_SNA and (
+            after["LastMealId"] == MEAL_SNA or (after["LastMealId"] - before["LastMealId"]) % MEAL_IDS > MEAL_IDS // 2
+        )
+        iob = before["InsulinOnBoard"] * IOB_KEPT**steps - IOB_SLACK > after["InsulinOnBoard"]
+        return mode or meal or iob
+
+
 class Monitor:
     """Counts hazards frame by frame."""
 
@@ -173,7 +212,8 @@ class Monitor:
         self._start()
 
     def _start(self) -> None:
-        self.hazards = dict.fromkeys(("H1", "H2", "H3", "H4", "H5", "H6", "H7"), 0)
+        self.hazards = dict.fromkeys(("H1", "H2", "H3", "H4", "H5", "H6", "H7", "H8"), 0)
+        self._resets = _ResetWatch(self.hazards)
         self._boluses = _BolusWatch(self.hazards)
         self._step = -1  # of the newest token
         self._boot_count: int | None = None
@@ -260,6 +300,11 @@ class Monitor:
     def _on_hb_ctrl(self, values: dict[str, int]) -> None:
         if values["NmtCtrl"] == NMT_BOOT_UP:
             self._receiver.reset()  # a device that starts anew begins its counters at 0
+            if self._phase in (Phase.STEP, Phase.CONTINUE):
+                self._resets.boot()
+
+    def _on_mode_cmd(self, _values: dict[str, int]) -> None:
+        self._resets.mode()
 
     def _on_pump_boluscmd(self, values: dict[str, int]) -> None:
         self._boluses.command(values, self._step)
@@ -272,6 +317,7 @@ class Monitor:
             self._lost_alarm = values["CtrlAlarmState"] != ALARM_INACTIVE
 
     def _on_ctrl_status(self, values: dict[str, int]) -> None:
+        self._resets.status(values, self._step)
         self._used = values["LastCgmSeq"]
         self._state = values["CtrlState"]
         self.limiter_steps += values["LimiterBits"] != 0
