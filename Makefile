@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test nightly mutation lint docs benchmark clean
+.PHONY: help setup run test coverage nightly mutation lint docs benchmark clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -23,6 +23,9 @@ run: setup       ## one closed-loop day over the embedded bus, with a recording
 
 test: setup      ## linters, then all tests: on the embedded bus here, on a real vcan through tools/with_vcan
 	tools/run_tests
+
+coverage: setup  ## lines and branches of the firmware that no test runs: none may be left
+	$(BIN)/python -m pytest -m "not vcan" -n logical --dist loadfile --cov --cov-report=term-missing
 
 nightly: setup   ## the long tests: 10000 hostile sequences, a million random frames, the oracle in all pairs
 	PUMPBENCH_NIGHTLY=1 PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 \

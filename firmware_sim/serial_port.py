@@ -33,7 +33,7 @@ class SerialPort:
 
     Args:
         name: `pty` or `pty:/path/of/a/link` for a pseudo terminal of its own, else a device or URL of pyserial
-            (`/dev/ttyUSB0`, `socket://127.0.0.1:4000`, `loop://`).
+            (`/dev/ttyUSB0`, `socket://127.0.0.1:4000`).
 
     Attributes:
         name: what to open on the other side, for a pseudo terminal its path.
@@ -55,10 +55,13 @@ class SerialPort:
         try:
             url = urlsplit(name)  # not a comparison of prefixes: SOCKET:// and 127.0.0.1:1@elsewhere are URLs too
             away = url.scheme in NETWORK and url.hostname not in LOOPBACK
+            itself = url.scheme == "loop"
         except ValueError as error:
             raise PortError(f"{name}: {error}") from None
         if away:
             raise PortError(f"{name}: a socket must be on the loopback, e.g. socket://127.0.0.1:4000")
+        if itself:
+            raise PortError(f"{name}: leads back to the console itself, expected a port with another side")
         try:
             self._serial = serial.serial_for_url(name, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
@@ -95,7 +98,7 @@ class SerialPort:
             return self._descriptors[0]
         try:
             return int(self._serial.fileno())  # type: ignore[union-attr]
-        except (AttributeError, OSError):  # loop:// and others; io.UnsupportedOperation is an OSError
+        except (AttributeError, OSError):  # rfc2217:// and others; io.UnsupportedOperation is an OSError
             return -1
 
     def wait(self, seconds: float) -> None:

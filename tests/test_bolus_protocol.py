@@ -352,3 +352,19 @@ def test_a_refusal_lowers_the_limit_and_what_was_accepted_may_raise_it(result: i
     talk.speak()
     talk.ack(INSULIN, Op.PROGRAM, result, AckLimitRaw=told)
     assert talk.boluses.limit == {INSULIN: after, PRAMLINTIDE: 4000}
+
+
+def test_a_phase_the_firmware_does_not_know_settles_nothing() -> None:
+    talk = committed()
+    talk.tell(INSULIN, Phase.IDLE, number=0)
+    assert talk.next() == []
+    assert talk.boluses.remaining(INSULIN) == 250
+
+
+def test_pramlintide_that_is_refused_itself_does_not_end_the_insulin_of_its_meal() -> None:
+    talk = Talk((INSULIN, 250), (PRAMLINTIDE, 300))
+    talk.speak()
+    talk.ack(INSULIN, Op.PROGRAM)
+    talk.ack(PRAMLINTIDE, Op.PROGRAM, echo=299)
+    talk.boluses.listen()
+    assert talk.speak() == [(INSULIN, Op.COMMIT), (PRAMLINTIDE, Op.CANCEL)]

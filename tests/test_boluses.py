@@ -10,6 +10,7 @@ from pumpbench.calibration import MODES, Tuning
 from can_bus import codec
 from can_bus.frame import Frame
 from firmware_sim.alarms import Code
+from firmware_sim.control import layout
 from firmware_sim.ladder import State
 
 INSULIN, PRAMLINTIDE = 1, 2
@@ -375,3 +376,15 @@ def test_five_resets_in_an_hour_hold_the_schedule() -> None:
     pair.play()
     assert pair.boots == 5
     assert set(pair.states()[-20:]) == {State.SAFE_BASAL}
+
+
+def test_a_pump_that_accepts_no_bolus_at_all_is_asked_once_and_then_told_as_limited() -> None:
+    pair = Pair("ma", meals=[(10, 60.0), (30, 60.0)], steps=40)
+    pair.plant._pump.boluses[INSULIN].max_raw = 0
+    pair.play()
+    programs = [values for values in pair.all("PUMP_BolusCmd") if values["BolusOp"] == 1]
+    assert {values["BolusId"] for values in programs} == {0}
+    assert pair.commits(INSULIN) == {}
+    limiters = [values["LimiterBits"] for values in pair.all("CTRL_Status")]
+    assert limiters[30] & layout.LIMITER_MAX_BOLUS
+    assert pair.alarms(Code.DOSE_LIMITED) and pair.ledgers_close()

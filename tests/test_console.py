@@ -472,3 +472,88 @@ def test_no_port_and_no_answer_are_one_line_each(tmp_path: Path) -> None:
     status, _, err = run_console(port.name, "--command", "status", "--timeout", "0.2")
     port.close()
     assert (status, err) == (3, "pumpbench: nobody answers on this port within 0.2 s\n")
+
+
+def test_an_alarm_that_goes_on_is_not_logged_again(bench: Bench) -> None:
+    view = FirmwareView(bench.firmware)  # type: ignore[arg-type]
+    logged: list[str] = []
+    view.log = lambda _level, _seconds, _module, text: logged.append(text)
+    alarms = bench.firmware._alarms  # type: ignore[attr-defined]
+    alarms.hold(Code.CGM_LOST, True, 7)
+    view.publish()
+    alarms.hold(Code.E2E_FAULT, True, 0)
+    view.publish()
+    assert [text.split()[0] for text in logged] == ["cgm_lost", "e2e_fault"]
+
+
+def test_the_view_answers_for_the_device(bench: Bench) -> None:
+    console = Console(FirmwareView(bench.firmware))  # type: ignore[arg-type]
+    assert say(console, "get CfgBasal") == ["CfgBasal=1425", "OK"]
+    assert say(console, "version")[0].startswith("firmware=")
+    assert say(console, "set log=debug") == ["OK"]
+    assert say(console, "set log=loud")[0].startswith("ERR")
+
+
+class Remote:
+    """A port of pyserial without a descriptor, as rfc2217:// is one."""
+
+    def __init__(self, *_arguments: object, **_options: object) -> None:
+        self.sent = b""
+        self.full = self.gone = False
+
+    def read(self, _size: int) -> bytes:
+        if self.gone:
+            raise serial.SerialException("connection failed")
+        return b"status"
+
+    def write(self, data: bytes) -> None:
+        if self.full:
+            raise serial.SerialTimeoutException("Write timeout")
+        if self.gone:
+            raise serial.SerialException("connection failed")
+        self.sent += data
+
+    def close(self) -> None:
+        self.gone = True
+
+
+def test_a_port_without_a_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
+    remote = Remote()
+    monkeypatch.setattr(serial, "serial_for_url", lambda *_arguments, **_options: remote)
+    port = SerialPort("rfc2217://127.0.0.1:4000")
+    assert port.fileno() == -1
+    port.wait(0.0)
+    assert port.read() == b"status"
+    remote.full = True
+    port.write(b"one")
+    remote.full = False
+    port.write(b" two")
+    assert remote.sent == b"one two"
+    port.close()
+    with pytest.raises(PortError, match=r"rfc2217.*connection failed"):
+        port.read()
+    with pytest.raises(PortError, match=r"rfc2217.*connection failed"):
+        port.write(b"x")
+
+
+def test_a_url_that_is_none_is_named() -> None:
+    with pytest.raises(PortError, match=r"socket://\["):
+        SerialPort("socket://[")
+    with pytest.raises(PortError, match=r"loop://.*another side"):
+        SerialPort("loop://")
+
+
+def test_a_pty_that_is_full_keeps_what_it_could_not_send(tmp_path: Path) -> None:
+    port = SerialPort("pty")
+    sent = b"".join(b"%06d\n" % number for number in range(3000))  # more than a terminal holds
+    port.write(sent)
+    port.write(b"")
+    reader = os.open(port.name, os.O_RDONLY | os.O_NONBLOCK)
+    received = b""
+    while len(received) < len(sent):
+        received += os.read(reader, 4096)
+        port.write(b"")
+    os.close(reader)
+    port.close()
+    assert received == sent
+    assert port.dropped == 0

@@ -15,7 +15,7 @@ from can_bus.frame import Frame
 from can_bus.lockstep import Done, Phase
 from firmware_sim.alarms import PRIORITY, STEPS_AT_LEAST, Code, Priority
 from firmware_sim.alarms import State as AlarmState
-from firmware_sim.firmware import SUPPORTED_MODES, VERSION, subscriptions
+from firmware_sim.firmware import SUPPORTED_MODES, VERSION, Firmware, subscriptions
 from firmware_sim.ladder import State
 from firmware_sim.pump import RATE_EXPIRES_AFTER, Op, Pump
 
@@ -680,3 +680,7 @@ def test_every_change_of_state_is_told_in_the_same_step(seed: int, confirming: b
     auto, degraded, safe, uncertain = State.AUTO, State.DEGRADED, State.SAFE_BASAL, State.DELIVERY_UNCERTAIN
     assert {(auto, degraded), (degraded, safe), (safe, degraded), (degraded, auto), (auto, uncertain)} <= pairs
     assert {(uncertain, auto), (uncertain, degraded), (uncertain, safe)} & pairs
+
+
+def test_a_device_that_was_not_reset_says_nothing_by_itself() -> None:
+    assert Firmware().start() == []

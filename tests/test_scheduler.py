@@ -1,5 +1,7 @@
 """Tasks, budgets, the watchdog, and what the device finds wrong with itself."""
 
+from typing import Any
+
 import pytest
 from bench import GLUCOSE, S2, Bench
 
@@ -11,7 +13,7 @@ from firmware_sim.firmware import FRAMES_AT_MOST, NVM_WORDS, Firmware
 from firmware_sim.ladder import State
 from firmware_sim.nvm import RamMemory, memory_size
 from firmware_sim.scheduler import BITES_AFTER, Scheduler, Task
-from firmware_sim.selftest import Failure, check_program, check_ram
+from firmware_sim.selftest import PATTERNS, Failure, check_program, check_ram
 
 
 def counting(log: list[str], name: str, work: list[int], period: int = 300, budget: int = 5) -> Task:
@@ -174,3 +176,14 @@ def broken() -> RamMemory:
     memory = RamMemory(memory_size(NVM_WORDS))
     memory.write(0, bytes(range(256)))
     return memory
+
+
+def test_a_memory_that_does_not_take_back_what_it_held_is_found() -> None:
+    class Leaky(list[int]):
+        """Takes every pattern, and loses one bit of anything else."""
+
+        def __setitem__(self, where: Any, words: Any) -> None:
+            super().__setitem__(where, [word if word in PATTERNS else word & ~1 for word in words])
+
+    assert check_ram(Leaky([3, 5])) == Failure.RAM
+    assert check_ram([3, 5]) == Failure.NONE
