@@ -214,8 +214,6 @@ class Nvm:
         self._capacity = capacity_words
         self._wear = [0, 0]
         self.fallbacks = 0
-        self.blank = True
-        self.damaged = False
         self._scan()
 
     def wear(self, bank: int) -> int:
@@ -272,7 +270,7 @@ class Nvm:
         banks = [_Bank(content, self._capacity) for content in data]
         newest: int | None = None
         for bank, found in enumerate(banks):
-            self._wear = [max(known, told) for known, told in zip(self._wear, found.wear, strict=True)]
+            self._wear = [max(self._wear[each], found.wear[each]) for each in range(2)]
             if found.words is not None and (newest is None or _is_newer(found.generation, banks[newest].generation)):
                 newest = bank
         self.blank = not any(found.written for found in banks)

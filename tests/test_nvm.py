@@ -397,3 +397,75 @@ def test_no_record_that_was_not_stored(
         if found is None:
             assert whole < 2
             whole = 0
+
+
+def test_generations_count_one_by_one() -> None:
+    memory = RamMemory(SIZE)
+    nvm = Nvm(memory, CAPACITY)
+    for number in range(4):
+        nvm.store([number])
+    assert memory.read(BANK, len(record(3, [3]))) == record(3, [3], (2, 2))
+
+
+@pytest.mark.parametrize("content", [b"", bytes(range(200))])
+def test_after_the_first_record_nothing_is_blank_or_damaged(content: bytes) -> None:
+    memory = RamMemory(SIZE)
+    memory.write(0, content[:SIZE])
+    nvm = Nvm(memory, CAPACITY)
+    assert (nvm.blank, nvm.damaged) == (content == b"", content != b"")
+    nvm.store([1])
+    assert (nvm.blank, nvm.damaged) == (False, False)
+
+
+@pytest.mark.parametrize("distance", [0, 1 << 31])
+def test_of_two_banks_that_neither_follow_the_first_is_taken(distance: int) -> None:
+    """Nothing the firmware writes; whatever it is, it is one of both and always the same."""
+    nvm = Nvm(two_banks(record(5, [1]), record(5 + distance, [2])), CAPACITY)
+    assert nvm.load() == [1]
+
+
+def test_what_lies_behind_the_banks_is_no_record() -> None:
+    memory = RamMemory(SIZE + BANK)
+    memory.write(SIZE, record(9, [9]))
+    nvm = Nvm(memory, CAPACITY)
+    assert nvm.blank
+    assert nvm.load() is None
+
+
+@pytest.mark.parametrize("torn_garbage", [None, False, True])
+def test_the_byte_in_which_the_power_fails(tmp_path: Path, torn_garbage: bool | None) -> None:
+    options = {} if torn_garbage is None else {"torn_garbage": torn_garbage}
+    with closing(FileMemory(str(tmp_path / "nvm"), SIZE, **options)) as file:
+        for memory in (RamMemory(SIZE, **options), file):
+            memory.power_fails_after(1)
+            with pytest.raises(PowerLost):
+                memory.write(0, b"\x11\x22\x33")
+            assert memory.read(0, 3) == (b"\x11\xf2\xff" if torn_garbage else b"\x11\xff\xff")
+
+
+def test_a_file_is_opened_as_asked_and_written_through(tmp_path: Path) -> None:
+    path = tmp_path / "nvm"
+    opened: list[str] = []
+
+    def opener(name: str, flags: int) -> int:
+        opened.append(name)
+        return private(name, flags)
+
+    for number in range(2):
+        with closing(FileMemory(str(path), SIZE, opener=opener)) as memory:
+            memory.write(8, bytes([number]))
+            assert path.read_bytes()[8] == number  # what a killed process leaves behind
+            assert memory.read(8, 3) == bytes([number, 255, 255])
+    assert len(opened) == 3  # looked for, made, found
+
+
+def test_a_file_that_lost_its_erased_end_keeps_its_record(tmp_path: Path) -> None:
+    path = tmp_path / "nvm"
+    with closing(FileMemory(str(path), SIZE)) as memory:
+        nvm = Nvm(memory, CAPACITY)
+        nvm.store([1])
+        nvm.store([2])
+        with path.open("r+b") as file:
+            file.truncate(SIZE - 8)
+        assert nvm.load() == [2]
+        assert nvm.fallbacks == 0

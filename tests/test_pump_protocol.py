@@ -62,6 +62,7 @@ def test_refusals_are_counted_one_by_one_for_both_drugs() -> None:
         ((0, 8000), (100, 200), (0, 0)),
         ((8000, 150), (100, 200), (100, 150)),
         ((50, 90), (100, 200), (50, 90)),
+        ((200, 8000), (400, 100), (200, 50)),
         ((0, 0), (0, 0), (0, 0)),
     ],
 )
@@ -79,6 +80,14 @@ def test_without_a_rate_no_limit_cuts_and_no_field_is_filled() -> None:
     pump = Pump()
     pump.rate_limit = 0
     for op in (Op.SUSPEND, Op.RESUME_SCHEDULE):
-        cut, values = command(pump, op)
-        assert not cut
+        wire = Wire()
+        assert not pump.command(wire, op, 7)  # type: ignore[arg-type]
+        (values,) = wire.sent
         assert "InsulinRate" not in values and "PramlintideRate" not in values
+
+
+@pytest.mark.parametrize(("op", "rate"), [(Op.SET_RATE, 240), (Op.SUSPEND, 0), (Op.RESUME_SCHEDULE, -1)])
+def test_the_rate_in_force_is_kept_over_a_reset(op: Op, rate: int) -> None:
+    pump = Pump()
+    command(pump, op, 240)
+    assert pump.save()[-1] == rate

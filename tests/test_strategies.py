@@ -2,7 +2,7 @@
 
 import pytest
 
-from firmware_sim.control import layout, limits, prandial
+from firmware_sim.control import core, layout, limits, prandial
 from firmware_sim.control.layout import MEAL_CARBS, MEAL_NONE, MEAL_SIMPLE, MEAL_SNACK
 from firmware_sim.control.strategies import s1, s3, s4
 
@@ -31,6 +31,40 @@ def inputs(**values: int) -> list[int]:
 
 def outputs(**values: int) -> list[int]:
     return words(layout.OUTPUTS, **values)
+
+
+# ---- the core's own bookkeeping
+
+
+@pytest.mark.parametrize(
+    ("glucose", "reset", "before", "after"),
+    [
+        (1300, 0, 0, 1),
+        (1300, 0, 1, 2),
+        (1300, 0, 2, 3),
+        (1300, 0, 3, 3),  # no further than anybody asks
+        (0, 0, 1, 2),  # zero is a sample
+        (-1, 0, 3, 0),  # a missing one ends the row
+        (1300, 1, 3, 1),  # and so does a new start
+    ],
+)
+def test_a_trend_is_a_row_of_samples(glucose: int, reset: int, before: int, after: int) -> None:
+    words = state(TREND=before, GLUCOSE=1200, GLUCOSE_1=1100, GLUCOSE_2=1000)
+    core.follow_trend(words, inputs(IN_GLUCOSE=glucose, IN_RESET=reset))
+    shifted = (1200, 1100) if glucose >= 0 else (1100, 1000)
+    assert (words[layout.TREND], words[layout.GLUCOSE_1], words[layout.GLUCOSE_2]) == (after, *shifted)
+    assert words[layout.GLUCOSE] == 1200  # the observer's to change
+
+
+@pytest.mark.parametrize("word", [layout.BOLUS_WAIT, layout.PRAM_WAIT])
+def test_waiting_ends(word: int) -> None:
+    words = state()
+    words[word] = 3
+    seen = []
+    for _ in range(5):
+        core.wait(words)
+        seen.append(words[word])
+    assert seen == [2, 1, 0, 0, 0]
 
 
 # ---- strategy 1
@@ -66,6 +100,12 @@ def test_slopes_are_followed_on_the_unrounded_signal(u: int, rising: int) -> Non
     _, memory, flashed = peaking()
     s1.peak(u, memory, flashed)
     assert (memory[layout.DEMAND], memory[layout.RISING]) == (u, rising)
+
+
+def test_a_dose_starts_the_wait_of_z_3_steps() -> None:
+    words = state()
+    assert s1.dose(words, parameters(PEAK_LOCKOUT=12)) == 300
+    assert words[layout.PEAK_WAIT] == 13
 
 
 @pytest.mark.parametrize("lockout", [0, 1, 12, 255])
