@@ -187,7 +187,7 @@ def test_agrees_with_dop853_to_a_hundredth_of_a_mg_per_dl(name, kind, drug, reco
     variability = physiology.Variability(11, name)
     course = busy_days(patient, days=14 if FULL else 1, pramlintide=drug != NO_DRUG)
     error = np.abs(run(patient, variability, course) - dop853(patient, variability, course)).max()
-    record_property("error_mg_dl", error)
+    record_property("error_mg_dl", float(error))
     print(f"{name} {kind} {drug or 'no pramlintide'}: {error:.2e} mg/dL")
     assert error <= 0.01
 
