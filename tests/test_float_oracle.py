@@ -5,7 +5,6 @@ with the firmware. It sees what the firmware sees on the bus: the CGM's readings
 ladder allowed. Compared are the rates the firmware commanded, and the demand it computed before limits and rounding.
 """
 
-import csv
 import os
 from collections import deque
 from dataclasses import dataclass, field
@@ -13,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 import pytest
-from pumpbench.calibration import DATA, MODES, Tuning, calibrate, lags, lead, tuning_for
+from pumpbench.calibration import MODES, Tuning, calibrate, lead, tuning_for
+from pumpbench.controller_model import ControllerModel, lags, shipped_models
 from scipy import signal
 
 from can_bus import codec
@@ -42,11 +42,14 @@ STEPS_PER_DAY = 288
 ADULTS = tuple(f"adult#{number:03d}" for number in range(1, 11))
 
 
+MODEL = shipped_models()["adult#001"]
+"""Its time constants are those of all adults."""
+
+
 def gains(name: str) -> tuple[float, float]:
     """K_d in mg/dL per g/min and K_u in mg/dL per U/min of one patient."""
-    lines = [line for line in DATA.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
-    rows = {row["patient"]: row for row in csv.DictReader(lines)}
-    return float(rows[name]["K_d"]), float(rows[name]["K_u"])
+    model = shipped_models()[name]
+    return model.K_d, model.K_u
 
 
 # ---- the oracle
@@ -72,17 +75,17 @@ class Oracle:
         self.target = patient.basal_glucose
         self.max_basal = max(tuning.max_basal, self.basal)
         self.mode, self.tuning = mode, tuning
-        self.carb_ratio = patient.carb_ratio_g_per_u
+        self.carb_ratio = shipped_models()[patient.name].carb_ratio
         self.ratio = tuning.pram_ratio if mode in (MODES["s2"], MODES["s4"]) else 0.0
         meal_gain, insulin_gain = gains(patient.name)
         self.meal_gain = meal_gain
         self.gamma = tuning.gain * meal_gain / insulin_gain
         # G_u(s) = K_u / ((tau_1u s + 1)^2 (tau_2u s + 1)), insulin held over a sample
-        poles = np.polymul(np.polymul([tuning.tau_1u, 1], [tuning.tau_1u, 1]), [tuning.tau_2u, 1])
+        poles = np.polymul(np.polymul([MODEL.tau_1u, 1], [MODEL.tau_1u, 1]), [MODEL.tau_2u, 1])
         numerator, denominator, _ = signal.cont2discrete(([insulin_gain], poles), T, method="zoh")
         self.insulin_model = numerator.ravel(), denominator
         # F(s) G_d(s)^-1 = (tau_1d s + 1)^2 (tau_2d s + 1) / (theta s + 1)^3 / K_d, by Tustin's rule
-        zeros = np.polymul(np.polymul([tuning.tau_1d, 1], [tuning.tau_1d, 1]), [tuning.tau_2d, 1])
+        zeros = np.polymul(np.polymul([MODEL.tau_1d, 1], [MODEL.tau_1d, 1]), [MODEL.tau_2d, 1])
         filtered = np.polymul(np.polymul([tuning.theta, 1], [tuning.theta, 1]), [tuning.theta, 1])
         self.observer = signal.bilinear(zeros, filtered, fs=1 / T)
 
@@ -261,7 +264,10 @@ class Errors:
     odd: int  # boluses that only one of the two gave
 
 
-def compare(name: str, strategy: str, days: int, tuning: Tuning | None = None, wrong: Tuning | None = None) -> Errors:
+Wrong = Tuning | ControllerModel
+
+
+def compare(name: str, strategy: str, days: int, tuning: Tuning | None = None, wrong: Wrong | None = None) -> Errors:
     """Run one patient in the closed loop and hold the oracle against the firmware.
 
     Args:
@@ -269,11 +275,14 @@ def compare(name: str, strategy: str, days: int, tuning: Tuning | None = None, w
         strategy: as on the command line.
         days: of the validation scenario.
         tuning: of both.
-        wrong: of the firmware, if that shall differ from the oracle's.
+        wrong: tuning or model of the firmware, if that shall differ from the oracle's.
     """
     patient, tuning = load_patient(name), tuning or tuning_for(strategy)
     mode = MODES[strategy]
-    calibration = calibrate(patient, wrong or tuning)
+    if isinstance(wrong, ControllerModel):
+        calibration = calibrate(patient, tuning, wrong)
+    else:
+        calibration = calibrate(patient, wrong or tuning)
     run = Run(patient, load_scenario("validation-14d"), days * STEPS_PER_DAY, 1, mode, calibration)
     loop = Loop().play(run)
     assert loop.diag["SaturationCount"] == loop.diag["LostFrameCount"] == loop.diag["E2eErrorCount"] == 0
@@ -327,10 +336,12 @@ def test_a_limit_that_bites_is_kept_to_the_same_lsb() -> None:
     assert errors.day < 0.001
 
 
-@pytest.mark.parametrize("wrong", [{"theta": 12.05}, {"gain": 0.681}, {"tau_2u": 324.0}, {"pram_ratio": 10.1}])
-def test_the_oracle_notices_a_controller_that_is_slightly_off(wrong: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "wrong", [Tuning(theta=12.05), Tuning(gain=0.681), Tuning(pram_ratio=10.1), MODEL._replace(tau_2u=324.0)]
+)
+def test_the_oracle_notices_a_controller_that_is_slightly_off(wrong: Wrong) -> None:
     """What is flashed differs by half a percent or so from what the oracle was told."""
-    errors = compare("adult#001", "s2", days=1, wrong=Tuning(**wrong))
+    errors = compare("adult#001", "s2", days=1, wrong=wrong)
     assert errors.demand > 0.25 or errors.pramlintide > 1
 
 
@@ -432,7 +443,7 @@ def test_a_meal_of_50_g_is_estimated_as_50_g(name: str) -> None:
     eaten = np.zeros(steps * substeps)
     start, minutes = 20, 15
     eaten[(start + DELAY) * substeps : (start + DELAY + minutes // 5) * substeps] = 50 / minutes  # g/min, 15 min late
-    rise = responses(([meal_gain], cascade(tuning.tau_1d, tuning.tau_1d, tuning.tau_2d)), eaten)
+    rise = responses(([meal_gain], cascade(MODEL.tau_1d, MODEL.tau_1d, MODEL.tau_2d)), eaten)
     meal = (core_demand(flashed(name), patient.basal_glucose + rise, None) - patient.basal_u_per_h) / 60 / gamma
     assert meal.sum() * T == pytest.approx(50, rel=0.02)
     assert np.abs(meal[:start]).max() < 0.02  # nothing before the meal
@@ -457,7 +468,7 @@ def test_insulin_whose_effect_is_seen_is_no_meal(name: str) -> None:
     above = np.zeros(steps * substeps)
     held = np.repeat((delivered - basal) / T, substeps)
     above[DELAY * substeps :] = held[: -DELAY * substeps]
-    fall = responses(([insulin_gain], cascade(tuning.tau_1u, tuning.tau_1u, tuning.tau_2u)), above)
+    fall = responses(([insulin_gain], cascade(MODEL.tau_1u, MODEL.tau_1u, MODEL.tau_2u)), above)
     reported = np.concatenate([[basal], delivered[:-1]])  # the total of an instant is of the sample before it
     demand = core_demand(parameters, patient.basal_glucose - fall, reported)
     assert fall.max() > 10  # mg/dL: there was something to explain

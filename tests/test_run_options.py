@@ -113,5 +113,28 @@ def test_a_patient_of_an_own_file_is_not_given_somebody_elses_controller(pumpben
     own.write_text(Path(patients.__file__).with_name("data").joinpath("adults.csv").read_text())
     done = pumpbench("run", "--patient", f"{own}#adult#001", "--bus", "inproc", "--out", runs / "out")
     assert done.returncode == 2
-    assert "there is no controller model for patients of your own files yet" in done.stderr
+    assert "pumpbench identify-controller" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_patients_of_an_own_file_run_with_models_identified_from_them(pumpbench: Pumpbench, runs: Path) -> None:
+    """A cohort of two, whose time constants differ from those of the ten: from the file to the closed loop."""
+    from plant_server.physiology import patients
+
+    shipped = Path(patients.__file__).with_name("data").joinpath("adults.csv").read_text()
+    lines = [line for line in shipped.splitlines() if not line.startswith("#")]
+    own, models = runs / "own.csv", runs / "models.csv"
+    own.write_text("\n".join([lines[0], lines[3], lines[7]]) + "\n")
+    done = pumpbench("identify-controller", own, "--out", models)
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["patient", "adult#003", "adult#007"]
+    again = pumpbench("identify-controller", own, "--out", models)
+    assert again.returncode == 2 and "--overwrite" in again.stderr
+    arguments = ("--controller", models, "--days", "0.5", "--bus", "inproc", "--out", runs / "out")
+    done = pumpbench("run", "--patient", own, *arguments)
+    assert done.returncode == 0, done.stderr
+    info = json.loads((runs / "out" / f"{own}-adult-003".replace("/", "_") / "run.json").read_text())
+    assert info["patient"] == f"{own}#adult#003"
+    wrong = pumpbench("run", "--patient", "adult#001", *arguments)
+    assert wrong.returncode == 2
+    assert "no model of patient 'adult#001'; it has adult#003, adult#007" in wrong.stderr

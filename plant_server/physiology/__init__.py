@@ -5,7 +5,7 @@ from .glucose import glucose, interstitial
 from .insulin import plasma_insulin
 from .integrate import STEP_MIN, advance
 from .parameters import PARAMETERS, Parameter
-from .patients import PHYSIOLOGIES, Patient, PatientError, cohort, load_patient, pramlintide_sets
+from .patients import PHYSIOLOGIES, Patient, PatientError, cohort, load_patient, patients_of, pramlintide_sets
 from .pramlintide import eta, plasma_pramlintide
 from .states import STATES, State
 from .variability import NOMINAL, SOURCES, MealFactors, Variability
@@ -30,6 +30,7 @@ __all__ = [
     "glucose",
     "interstitial",
     "load_patient",
+    "patients_of",
     "plasma_insulin",
     "plasma_pramlintide",
     "pramlintide_sets",

@@ -126,6 +126,15 @@ def cohort() -> tuple[str, ...]:
     return tuple(_table(_COHORT, "Name"))
 
 
+def patients_of(path: Path) -> tuple[str, ...]:
+    """Names of the patients in a file of your own.
+
+    Raises:
+        PatientError: the file cannot be used.
+    """
+    return tuple(_table(path, "Name"))
+
+
 def load_patient(
     name: str,
     *,

@@ -4,21 +4,12 @@ This is the tool on the clinic's PC, not the pump: it may use floats. The firmwa
 index, and a CRC over the set.
 """
 
-import csv
-import functools
 from dataclasses import dataclass
-from pathlib import Path
-
-import numpy as np
-from scipy.linalg import expm
 
 from can_bus import codec
 from firmware_sim.calibration import SET_CRC_INDEX, set_crc
 from plant_server.physiology import Patient
-
-SAMPLE_MINUTES = 5.0
-
-DATA = Path(__file__).with_name("data") / "controller_adults.csv"
+from pumpbench.controller_model import SAMPLE_MINUTES, ControllerModel, lags, shipped_models
 
 MODES = {"nma": 2, "ma": 3, "sma": 4, "s1": 5, "s2": 6, "s3": 7, "s4": 8}
 """`--strategy` names of the paper's seven modes -> CtrlMode of the DBC."""
@@ -34,10 +25,6 @@ class Tuning:
 
     theta: float = 12.0  # min, time constant of the filter F
     gain: float = 0.68  # gamma K_u / K_d: share of an ideal feedback; 1 would be integral action
-    tau_1d: float = 159.0  # min
-    tau_2d: float = 2.0
-    tau_1u: float = 79.0
-    tau_2u: float = 323.0
     bolus_deduction: float = 0.85  # share of a prandial bolus taken out of the feedback
     meal_factor: float = 0.8  # nu of the paper
     assumed_carbs: float = 25.0  # g, the paper's simplified meal
@@ -72,51 +59,34 @@ SAFE = Tuning(basal_factor=4.0, low_suspend=70.0, bolus_lockout=3, max_rise=2.0,
 """The limits of docs/design.md as a product would set them; the paper's runs would touch them."""
 
 
-@functools.cache
-def _gains() -> dict[str, tuple[float, float]]:
-    lines = (line for line in DATA.read_text(encoding="utf-8").splitlines() if not line.startswith("#"))
-    return {row["patient"]: (float(row["K_d"]), float(row["K_u"])) for row in csv.DictReader(lines)}
-
-
-def lags(taus: tuple[float, float, float], minutes: float = SAMPLE_MINUTES) -> tuple[np.ndarray, np.ndarray]:
-    """Three first-order lags in cascade with an exact hold of the input over one sample.
-
-    Args:
-        taus: time constants in min, in order from the input.
-        minutes: length of the sample.
-
-    Returns:
-        A (3x3, lower triangular) and B (3) of x(k+1) = A x(k) + B u(k); the output is x[2].
-    """
-    system = np.zeros((4, 4))
-    for i, tau in enumerate(taus):
-        system[i, i] = -1 / tau
-        system[i, i - 1 if i else 3] = 1 / tau
-    discrete = expm(system * minutes)
-    return discrete[:3, :3], discrete[:3, 3]
-
-
 def lead(tau: float, theta: float, minutes: float = SAMPLE_MINUTES) -> tuple[float, float, float]:
     """(tau s + 1)/(theta s + 1) by Tustin's rule: b0, b1, a1 of y(k) = b0 x(k) + b1 x(k-1) - a1 y(k-1)."""
     below = 1 + 2 * theta / minutes
     return (1 + 2 * tau / minutes) / below, (1 - 2 * tau / minutes) / below, (1 - 2 * theta / minutes) / below
 
 
-def calibrate(patient: Patient, tuning: Tuning | None = None) -> dict[int, int]:
+def calibrate(patient: Patient, tuning: Tuning | None = None, model: ControllerModel | None = None) -> dict[int, int]:
     """The calibration of one patient as CfgIndex -> raw value, with the CRC of the set at the end.
+
+    Args:
+        patient: whose basal rate and target are flashed.
+        tuning: what is common to all patients; default: `Tuning()`.
+        model: what the controller knows of the patient; default: the one that comes with the package.
 
     Raises:
         CalibrationError: the patient has no controller model, or a value is outside its parameter's range.
     """
     tuning = tuning or Tuning()
-    if patient.name not in _gains():
+    if model is None:
+        model = shipped_models().get(patient.name)
+    if model is None:
         raise CalibrationError(
-            f"no controller model for patient {patient.name!r} in {DATA.name}; it has {', '.join(_gains())}"
+            f"no controller model for patient {patient.name!r}: the package has {', '.join(shipped_models())}; "
+            "`pumpbench identify-controller` makes one for patients of your own"
         )
-    meal_gain, insulin_gain = _gains()[patient.name]
     physical = {
         "CfgBasal": patient.basal_u_per_h,
-        "CfgCarbRatio": patient.carb_ratio_g_per_u,
+        "CfgCarbRatio": model.carb_ratio,
         "CfgGlucoseTarget": patient.basal_glucose,
         "CfgMaxBasal": tuning.max_basal,
         "CfgMaxBolus": tuning.max_bolus,
@@ -125,9 +95,9 @@ def calibrate(patient: Patient, tuning: Tuning | None = None) -> dict[int, int]:
         "CfgPramBolus": tuning.pram_bolus,
         "CfgInsulinTdd": 24 * patient.basal_u_per_h * 2,
         "CfgStaleCgmLimit": 15.0,
-        "CfgMealGain": meal_gain,
-        "CfgInsulinGain": insulin_gain,
-        "CfgObserverGain": tuning.gain * meal_gain / insulin_gain,
+        "CfgMealGain": model.K_d,
+        "CfgInsulinGain": model.K_u,
+        "CfgObserverGain": tuning.gain * model.K_d / model.K_u,
         "CfgBolusDeduction": tuning.bolus_deduction,
         "CfgMealFactor": tuning.meal_factor,
         "CfgAssumedCarbs": tuning.assumed_carbs,
@@ -140,18 +110,18 @@ def calibrate(patient: Patient, tuning: Tuning | None = None) -> dict[int, int]:
         "CfgMaxRise": tuning.max_rise,
         "CfgPramTdd": tuning.pram_tdd,
         "CfgStuckSamples": tuning.stuck_samples,
-        **_coefficients(tuning),
+        **_coefficients(tuning, model),
     }
     raws = {index: _raw(name, physical[name]) for index, name in _indices().items() if name in physical}
     raws[SET_CRC_INDEX] = set_crc(raws)
     return raws
 
 
-def _coefficients(tuning: Tuning) -> dict[str, float]:
-    b0, b1, a1 = lead(tuning.tau_1d, tuning.theta)
-    c0, c1, _ = lead(tuning.tau_2d, tuning.theta)
+def _coefficients(tuning: Tuning, model: ControllerModel) -> dict[str, float]:
+    b0, b1, a1 = lead(model.tau_1d, tuning.theta)
+    c0, c1, _ = lead(model.tau_2d, tuning.theta)
     values = {"CfgLead1B0": b0, "CfgLead1B1": b1, "CfgLead2B0": c0, "CfgLead2B1": c1, "CfgLeadA1": a1}
-    matrix, inlet = lags((tuning.tau_1u, tuning.tau_1u, tuning.tau_2u))
+    matrix, inlet = lags((model.tau_1u, model.tau_1u, model.tau_2u))
     for i in range(3):
         values[f"CfgInsulinB{i + 1}"] = float(inlet[i])
         for j in range(i + 1):

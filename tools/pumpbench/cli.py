@@ -25,6 +25,7 @@ console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+PATIENTS = "A name, a comma list, or all; file.csv#name or file.csv for patients of your own, with --controller."
 SCENARIOS = "validation-14d, tuning, camerlingo, fasting, or a YAML or CSV file."
 SENSORS = "coloured, ideal, breton, facchinetti, dexcom-g5, dexcom-g6, vettoretti, or a YAML file."
 PHYSIOLOGIES = "Equations: S2008, or S2013 with counter-regulation (default: what the patient's file says)."
@@ -67,7 +68,7 @@ def _common(
 
 @app.command()
 def run(
-    patient: Annotated[str, typer.Option(help="One name, a comma list, or all; or file.csv#name.")] = "adult#001",
+    patient: Annotated[str, typer.Option(help=PATIENTS)] = "adult#001",
     strategy: Annotated[Strategy, typer.Option(help="Mode of the controller.")] = Strategy.S2,
     scenario: Annotated[str, typer.Option(help=SCENARIOS)] = "validation-14d",
     days: Annotated[float, typer.Option(help="Simulated days; rounded to steps of 5 min.", min=0.0)] = 1.0,
@@ -90,6 +91,7 @@ def run(
     physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,
     pramlintide: Annotated[str, typer.Option(help=PRAMLINTIDE)] = "P2",
     variability: Annotated[str, typer.Option(help=VARIABILITY)] = "all",
+    controller: Annotated[Path | None, typer.Option(help="Controller models, by identify-controller.")] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder to write (default: below runs/).")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing run folder at --out.")] = False,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware's first answer.")] = 20.0,
@@ -117,6 +119,7 @@ def run(
             physiology=physiology,
             pramlintide=pramlintide,
             variability=varying,
+            controller=controller,
             overwrite=overwrite or out is None,
             connect_timeout=connect_timeout,
             step_timeout=step_timeout,
@@ -131,9 +134,14 @@ def run(
 
 
 def _patients(text: str) -> list[str]:
-    from plant_server.physiology import cohort  # noqa: PLC0415
+    from plant_server.physiology import cohort, patients_of  # noqa: PLC0415
 
-    return list(cohort()) if text == "all" else [name.strip() for name in text.split(",")]
+    if text == "all":
+        return list(cohort())
+    names = []
+    for name in (part.strip() for part in text.split(",")):
+        names += [f"{name}#{row}" for row in patients_of(Path(name))] if name.endswith(".csv") else [name]
+    return names
 
 
 def _run_folder(out: Path | None, patient: str, several: bool, label: str) -> Path:
@@ -190,6 +198,33 @@ def _print_outcomes(folders: list[Path]) -> int:
     for folder in folders:
         console.print(f"recording: {folder / 'recording.rrd'}   picture: {folder / 'summary.png'}", soft_wrap=True)
     return total
+
+
+@app.command()
+def identify_controller(
+    patients: Annotated[str, typer.Argument(help="A name, a comma list, or all; file.csv#name or file.csv.")],
+    out: Annotated[Path, typer.Option(help="CSV file to write, for --controller.")],
+    physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing file at --out.")] = False,
+) -> None:
+    """Identify what the controller must know of patients: K, tau and CIR from their responses to a meal and insulin."""
+    from rich.table import Table  # noqa: PLC0415
+
+    from plant_server.physiology import load_patient  # noqa: PLC0415
+    from pumpbench.controller_model import COLUMNS, identify, write_models  # noqa: PLC0415
+
+    if out.exists() and not overwrite:
+        raise Failed(EXIT_USAGE, f"{out} exists already; give --overwrite to replace it")
+    loaded = [load_patient(name, physiology=physiology) for name in _patients(patients)]
+    with errors.status("identifying"):
+        models = identify(loaded)
+    write_models(out, models)
+    table = Table(box=None, header_style="bold")
+    for name in COLUMNS:
+        table.add_column(name, justify="left" if name == "patient" else "right")
+    for model in models:
+        table.add_row(model.patient, *(f"{value:.5g}" for value in model[1:]))
+    console.print(table)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
@@ -357,6 +392,7 @@ def _status(error: Exception) -> int | None:
     from plant_server.serve import MemberSilent  # noqa: PLC0415
     from plant_server.server import PlantError  # noqa: PLC0415
     from pumpbench.calibration import CalibrationError  # noqa: PLC0415
+    from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
 
@@ -365,7 +401,7 @@ def _status(error: Exception) -> int | None:
     if isinstance(error, Interrupted):
         return EXIT_INTERRUPTED
     wrong = BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
-    if isinstance(error, wrong | CalibrationError | RigError | RunFolderError):
+    if isinstance(error, wrong | CalibrationError | ControllerModelError | RigError | RunFolderError):
         return EXIT_USAGE
     if isinstance(error, NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD

@@ -34,15 +34,16 @@ from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.lockstep import STEPS_PER_DAY, Node
 from can_bus.url import open_link
-from plant_server.physiology import SOURCES, cohort, load_patient
+from plant_server.physiology import SOURCES, Patient, load_patient
 from plant_server.scenario import load_scenario
 from plant_server.sensor import load_sensor
 from plant_server.sensors.ideal import Ideal
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
 from pumpbench import __version__
-from pumpbench.calibration import MODES, CalibrationError, calibrate, tuning_for
+from pumpbench.calibration import MODES, calibrate, tuning_for
 from pumpbench.capture import Capture
+from pumpbench.controller_model import ControllerModel, ControllerModelError, read_models, shipped_models
 from pumpbench.faults import Faults, write_wire
 from pumpbench.faults import load as load_fault_file
 from pumpbench.recorder import write
@@ -81,6 +82,7 @@ class Request:
     physiology: str | None = None  # None: what the patient's file says
     pramlintide: str = "P2"
     variability: tuple[str, ...] = tuple(SOURCES)
+    controller: Path | None = None  # models of patients of one's own; None: those of the package
     overwrite: bool = False
     connect_timeout: float = 20.0
     step_timeout: float = 10.0
@@ -117,7 +119,8 @@ def prepare(request: Request) -> Prepared:
     """Look up patient, scenario, strategy, faults and calibration.
 
     Raises:
-        RigError, PatientError, ScenarioError, SensorError, CalibrationError, FileError: what is wrong with the request.
+        RigError, PatientError, ScenarioError, SensorError, ControllerModelError, CalibrationError, FileError: what is
+            wrong with the request.
     """
     if request.strategy not in MODES:
         raise RigError(f"there is no strategy {request.strategy!r}; choose one of {', '.join(MODES)}")
@@ -137,13 +140,9 @@ def prepare(request: Request) -> Prepared:
             f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
         )
     faults = load_fault_file(request.faults) if request.faults else Faults()
-    if request.patient not in cohort():
-        raise CalibrationError(
-            f"{request.patient}: there is no controller model for patients of your own files yet; "
-            f"the closed loop knows {', '.join(cohort())}"
-        )
+    model = controller_model(request.patient, patient, request.controller)
     sensor = load_sensor(request.sensor)
-    calibration = calibrate(patient, tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal)))
+    calibration = calibrate(patient, tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal)), model)
     mode = MODES[request.strategy]
     sensor = sensor.model_copy(update={"effects": (*sensor.effects, *faults.sensor)})
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, faults.pump)
@@ -175,6 +174,28 @@ def prepare(request: Request) -> Prepared:
         },
     }
     return Prepared(request, run, faults, info)
+
+
+def controller_model(asked: str, patient: Patient, file: Path | None) -> ControllerModel:
+    """The model the controller works with for one patient.
+
+    Args:
+        asked: the patient's name as it was given, with its file if it has one of its own.
+        patient: as loaded.
+        file: of models, or None for those of the package.
+
+    Raises:
+        ControllerModelError: there is none.
+    """
+    models = shipped_models() if file is None else read_models(file)
+    if file is None and asked not in models:
+        raise ControllerModelError(
+            f"{asked}: the package has controller models of {', '.join(models)} only; make one with "
+            f"`pumpbench identify-controller {asked} --out models.csv`, and give it with --controller models.csv"
+        )
+    if patient.name not in models:
+        raise ControllerModelError(f"{file}: no model of patient {patient.name!r}; it has {', '.join(models)}")
+    return models[patient.name]
 
 
 def _sha256(data: bytes) -> str:
