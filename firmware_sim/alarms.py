@@ -85,6 +85,8 @@ class Alarms:
     def __init__(self) -> None:
         self._active: dict[Code, _Alarm] = {}
         self._next_instance = 0
+        self._seen = 0  # bit per code: raised since boot
+        self._kept = 0  # bit per code: raised since the history was cleared, over resets
 
     def active(self, code: Code) -> bool:
         """Whether this alarm is in force, confirmed or not."""
@@ -96,6 +98,9 @@ class Alarms:
         To be called once per step. An alarm younger than `STEPS_AT_LEAST` outlives its cause.
         """
         alarm = self._active.get(code)
+        if cause:
+            self._seen |= 1 << code
+            self._kept |= 1 << code
         if cause and alarm is None:
             self._active[code] = _Alarm(self._next_instance, State.PENDING, aux & 0xFFFF)
             self._next_instance = (self._next_instance + 1) % INSTANCES
@@ -137,13 +142,25 @@ class Alarms:
             for code in order
         ]
 
+    def history(self, code: Code) -> tuple[bool, bool, bool]:
+        """Whether the alarm is in force, was raised since boot, and since `clear`."""
+        alarm = self._active.get(code)
+        in_force = alarm is not None and alarm.state != State.INACTIVE
+        return in_force, bool(self._seen >> code & 1), bool(self._kept >> code & 1)
+
+    def clear(self, code: Code) -> None:
+        """Forget that it was raised; an alarm in force stays in force, and is remembered again if its cause holds."""
+        self._seen &= ~(1 << code)
+        self._kept &= ~(1 << code)
+
     def save(self) -> list[int]:
-        """Words for the non-volatile memory: instances are not used twice."""
-        return [self._next_instance]
+        """Words for the non-volatile memory: instances are not used twice, and the history outlives a reset."""
+        return [self._next_instance, self._kept]
 
     def restore(self, words: Iterator[int]) -> None:
         """Take back what `save` wrote; causes that still hold raise their alarms anew."""
         self._next_instance = next(words)
+        self._kept = next(words)
 
     def renew(self, code: Code) -> None:
         """Something new of the same kind: pending again, also for a user who has confirmed the last one."""

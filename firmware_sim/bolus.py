@@ -103,6 +103,11 @@ class Boluses:
         """Whether a bolus of either drug may or may not have been given."""
         return any(bolus.uncertain for bolus in self._open.values())
 
+    @property
+    def open(self) -> bool:
+        """Whether a bolus of either drug is not settled."""
+        return bool(self._open)
+
     def ready(self, drug: Drug) -> bool:
         """Whether a bolus of this drug may be started."""
         return self.known and not self.uncertain and drug not in self._open

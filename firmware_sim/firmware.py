@@ -12,7 +12,7 @@ import enum
 from collections.abc import Callable, Iterator, Sequence
 
 import dbc
-from can_bus.codec import Check, Receiver, Transmitter
+from can_bus.codec import Check, Receiver, Transmitter, message
 from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Done, Phase, Turn
 
@@ -25,14 +25,20 @@ from .control.core import control_step
 from .control.fixed import Ints, round_divide
 from .control.layout import MODE_OFF, MODE_S4
 from .day import Day
+from .isotp import IsoTp
 from .ladder import AGE_DEGRADED, Ladder, State
 from .meals import Meals
 from .nvm import Memory, Nvm
 from .pump import Op, Pump
 from .scheduler import Scheduler, Task
 from .selftest import Failure, check_program, check_ram
+from .uds import CONFIRMED, FAILED, FAILED_SINCE_CLEAR, FAILED_THIS_CYCLE, Uds
 
 VERSION = (0, 2)
+
+SERIAL_NUMBER = b"REFERENCE-0001"
+DEVICE_ID = b"PUMPBENCHCTRL0001"
+"""In the place of a vehicle's 17 characters."""
 
 SUPPORTED_MODES = tuple(range(MODE_OFF, MODE_S4 + 1))
 """Modes this build accepts from MODE_Cmd; any other is refused with DoseRejected."""
@@ -91,9 +97,13 @@ class Cause(enum.IntEnum):
     PIN = 4
 
 
+DIAGNOSTICS = "UDS_Request"
+"""The one message that is answered out of turn, and that no task sees."""
+
+
 def subscriptions() -> list[str]:
     """Names of the messages the DBC addresses to CTRL."""
-    return [message.name for message in dbc.load().messages if "CTRL" in message.receivers]
+    return [each.name for each in dbc.load().messages if "CTRL" in each.receivers]
 
 
 class Firmware:
@@ -110,6 +120,8 @@ class Firmware:
         self.log: Callable[[str, int, str, str], None] = lambda _level, _seconds, _module, _text: None
         self._nvm = None if memory is None else Nvm(memory, NVM_WORDS)
         self._cause = cause
+        self._uds_request = message(DIAGNOSTICS).can_id
+        self._uds_response = message("UDS_Response").can_id
         self._handlers: dict[str, Callable[[dict[str, int]], None]] = {
             "CGM_Reading": self._on_cgm_reading,
             "PUMP_Status": self._on_pump_status,
@@ -133,7 +145,9 @@ class Firmware:
     def _boot(self) -> None:
         """Everything as after power-on."""
         self._transmitter = Transmitter()
-        self._receiver = Receiver(subscriptions())
+        self._receiver = Receiver(name for name in subscriptions() if name != DIAGNOSTICS)
+        self._isotp = IsoTp()
+        self._uds = Uds(self)
         self._turn = Turn(self._transmitter)
         self._calibration = Calibration()
         self._alarms = Alarms()
@@ -193,7 +207,9 @@ class Firmware:
     # ---- frames in
 
     def receive(self, frame: Frame) -> Sequence[Frame]:
-        """Take one frame; only a token is answered."""
+        """Take one frame; only a token is answered, and a tester."""
+        if frame.can_id == self._uds_request:
+            return self._diagnose(frame.data)
         check, name, values, _ = self._receiver.receive(frame)
         self._frames_heard += check != Check.UNKNOWN
         if check > Check.OK_SOME_LOST:
@@ -206,6 +222,14 @@ class Firmware:
         if handler is not None:
             handler(values)
         return ()
+
+    def _diagnose(self, data: bytes) -> list[Frame]:
+        """Answer a tester at once: it may be there without a bench, and must not wait for a turn of five minutes."""
+        request, frames = self._isotp.receive(data)
+        if request is not None:
+            answer = self._uds.answer(request)
+            frames += self._isotp.send(answer) if answer else []
+        return [Frame(self._uds_response, frame) for frame in frames]
 
     def _on_cgm_reading(self, values: dict[str, int]) -> None:
         self._samples.append(values)
@@ -315,6 +339,7 @@ class Firmware:
     def _run_step(self, step: int) -> None:
         self._skipped = 0 if self._step is None else step - self._step - 1
         self._step = step
+        self._uds.tick()
         if self._reset_here and self._last_reset < 0:
             self._count_reset(step)
         self._work = self._scheduler.run(step * STEP_SECONDS)
@@ -686,3 +711,54 @@ class Firmware:
         """Ask whoever runs this device to restart it; False without a memory to restart from."""
         self.reset_requested = self._nvm is not None
         return self.reset_requested
+
+    # ---- what a tester sees (`uds.Device`)
+
+    def identification(self) -> dict[int, bytes]:
+        """Data by identifier: docs/diagnostics.md has the table."""
+        major, minor = dbc.protocol_version()
+        counters = (
+            self._receiver.crc_errors + self._receiver.malformed,
+            self._lost_frames(),
+            self._sequence_errors + self._receiver.sequence_errors + self._refused_by_number(),
+            self._state[layout.SATURATIONS],
+            0 if self._nvm is None else self._nvm.fallbacks,
+            self._scheduler.overruns,
+            self._boots,
+        )
+        return {
+            0xF18C: SERIAL_NUMBER,
+            0xF190: DEVICE_ID,
+            0xF191: b"SIM",
+            0xF195: f"{VERSION[0]}.{VERSION[1]}".encode(),
+            0x0100: bytes([major, minor]),
+            0x0101: dbc.crc32().to_bytes(4, "big"),
+            0x0102: bytes([self._ladder.state, self._mode]),
+            0x0103: (STEP_SNA if self._step is None else self._step).to_bytes(4, "big"),
+            **{0x0110 + i: min(count, 0xFFFF).to_bytes(2, "big") for i, count in enumerate(counters)},
+        }
+
+    def dtc_status(self, code: Code) -> int:
+        """Status byte of an alarm's DTC."""
+        in_force, since_boot, since_clear = self._alarms.history(code)
+        kept = CONFIRMED | FAILED_SINCE_CLEAR if since_clear else 0
+        return (FAILED if in_force else 0) | (FAILED_THIS_CYCLE if since_boot else 0) | kept
+
+    def clear_dtcs(self, codes: tuple[Code, ...]) -> None:
+        """Forget what is remembered of these alarms; one that is in force stays in force."""
+        for code in codes:
+            self._alarms.clear(code)
+
+    def may_restart(self) -> bool:
+        """Whether no bolus is under way."""
+        return not self._boluses.open
+
+    def self_test(self) -> int:
+        """The tests of the boot once more, the memory's too; what fails counts as it would there."""
+        found = check_program() | check_ram(self._state, self._inputs, self._outputs)
+        if not self._calibration.intact:
+            found |= Failure.PARAMETERS
+        if self._nvm is not None and not self._nvm.intact():
+            found |= Failure.MEMORY
+        self._failures |= found
+        return found

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 MAGIC = 0x504E564D
-LAYOUT = 1
+LAYOUT = 2
 """Version of what the words mean; a record of another one is not taken up."""
 
 HEADER_WORDS = 7
@@ -219,6 +219,11 @@ class Nvm:
     def wear(self, bank: int) -> int:
         """How often a bank was written; a cut write counts where its header still tells of it."""
         return self._wear[bank]
+
+    def intact(self) -> bool:
+        """Whether there is a record to start from, or never was one."""
+        self._scan()
+        return not self.damaged
 
     def load(self) -> list[int] | None:
         """The newest intact record; None if there is none. Takes any content of the memory."""

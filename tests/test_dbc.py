@@ -33,7 +33,8 @@ from firmware_sim.control import core, layout
 
 MESSAGES = sorted(dbc.load().messages, key=lambda message: message.frame_id)
 SIGNALS = [(message, signal) for message in MESSAGES for signal in message.signals]
-HEARTBEATS = [message for message in MESSAGES if message.frame_id >= 0x700]
+HEARTBEATS = [message for message in MESSAGES if 0x700 <= message.frame_id < 0x780]
+DIAGNOSTICS = [message for message in MESSAGES if message.frame_id >= 0x7E0]
 PROTECTED = [message for message in MESSAGES if codec.message(message.name).data_ids]
 RESERVED = ("SNA", "Error")
 NEUTRAL = ("None", "No", "NoRequest")
@@ -177,6 +178,7 @@ def test_every_node_has_a_comment_and_takes_part() -> None:
         (("PLANT_Truth",), range(0x600, 0x601)),
         (("FAULT_Inject",), range(0x6F0, 0x6F1)),
         (("HB_CTRL", "HB_PUMP", "HB_CGM"), range(0x701, 0x780)),
+        (("UDS_Request", "UDS_Response"), range(0x7E0, 0x7F0)),
     ],
     ids=lambda value: f"{value.start:03X}" if isinstance(value, range) else None,
 )
@@ -198,7 +200,7 @@ def test_heartbeats_have_the_id_of_their_node() -> None:
 def test_what_dosing_nodes_say_and_hear_is_protected() -> None:
     dosing = {"CTRL", "PUMP", "CGM"}
     needs = {message.name for message in MESSAGES if dosing & {message.senders[0], *message.receivers}}
-    assert {message.name for message in PROTECTED} == needs - {message.name for message in HEARTBEATS}
+    assert {message.name for message in PROTECTED} == needs - {message.name for message in HEARTBEATS + DIAGNOSTICS}
 
 
 @each_message

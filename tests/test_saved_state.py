@@ -91,7 +91,7 @@ def test_what_is_not_known_is_minus_one_and_what_is_not_there_is_zero() -> None:
     assert Meals().save() == [-1]
     assert Pump().save() == [1022, -1, -1, -1, 0, -1]
     assert Boluses().save() == [0] * 13
-    assert Alarms().save() == [0]
+    assert Alarms().save() == [0, 0]
     assert Calibration().save() == [0]
 
 
