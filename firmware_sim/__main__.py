@@ -20,7 +20,7 @@ from can_bus.process import exit_status
 from can_bus.url import open_link
 
 from .console import Console, FirmwareView
-from .firmware import NVM_WORDS, Cause, Firmware, subscriptions
+from .firmware import NVM_WORDS, Cause, Firmware, own_messages, subscriptions
 from .nvm import FileMemory, NvmError, memory_size
 from .serial_port import PortError, SerialPort
 
@@ -94,7 +94,7 @@ def serve(
     token = message("SYNC_Step").can_id
     attended = None if port is None else _Attended(firmware, port)
     try:
-        with open_link(url, filters=[message(name).can_id for name in subscriptions()]) as link:
+        with open_link(url, filters=[message(name).can_id for name in [*subscriptions(), *own_messages()]]) as link:
             boot = firmware.start()
             if boot:
                 link.send(boot)

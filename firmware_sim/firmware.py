@@ -106,6 +106,11 @@ def subscriptions() -> list[str]:
     return [each.name for each in dbc.load().messages if "CTRL" in each.receivers]
 
 
+def own_messages() -> list[str]:
+    """Names of the messages that nobody but CTRL may send."""
+    return [each.name for each in dbc.load().messages if each.senders == ["CTRL"]]
+
+
 class Firmware:
     """The dosing controller, without a bus: see `can_bus.lockstep.Node`.
 
@@ -122,6 +127,7 @@ class Firmware:
         self._cause = cause
         self._uds_request = message(DIAGNOSTICS).can_id
         self._uds_response = message("UDS_Response").can_id
+        self._own_ids = frozenset(message(name).can_id for name in own_messages())
         self._handlers: dict[str, Callable[[dict[str, int]], None]] = {
             "CGM_Reading": self._on_cgm_reading,
             "PUMP_Status": self._on_pump_status,
@@ -190,6 +196,9 @@ class Firmware:
         self._sequence_errors = 0
         self._reported_state = State.INIT
         self._last_e2e_error = -STEP_SNA
+        self._impostors = 0  # frames with an id of ours that we did not send
+        self._impostors_seen = 0
+        self._last_impostor = -STEP_SNA
         self._last_implausible = -STEP_SNA
         self._last_limited = -STEP_SNA
         self._last_rejected = -STEP_SNA
@@ -211,6 +220,8 @@ class Firmware:
         if frame.can_id == self._uds_request:
             return self._diagnose(frame.data)
         check, name, values, _ = self._receiver.receive(frame)
+        if check == Check.UNKNOWN and frame.can_id in self._own_ids:
+            self._impostors += 1  # a node never hears itself
         self._frames_heard += check != Check.UNKNOWN
         if check > Check.OK_SOME_LOST:
             if check in (Check.REPEATED, Check.WRONG_SEQUENCE) and name == "CGM_Reading":
@@ -359,6 +370,9 @@ class Firmware:
     def _count_inputs(self) -> int:
         frames = self._frames_heard
         self._frames_heard = 0
+        if self._impostors > self._impostors_seen:
+            self._impostors_seen = self._impostors
+            self._last_impostor = self._now
         return frames
 
     def _task_sensor(self) -> int:
@@ -499,7 +513,8 @@ class Firmware:
             self._rejected = True
 
     def _may_bolus(self, drug: Drug, state: State) -> bool:
-        return state == State.AUTO and self._pump.heard and self._boluses.ready(drug)
+        alone = self._now - self._last_impostor >= ALARM_HOLD  # nobody else tells the pump what to give (E2E-05)
+        return state == State.AUTO and alone and self._pump.heard and self._boluses.ready(drug)
 
     def _insulin_left(self) -> int:
         """What twice the daily dose leaves within 24 h, in mU; a bolus under way counts (requirement LIM-06)."""
@@ -542,8 +557,8 @@ class Firmware:
     def _report_alarms(self, state: State, step: int) -> None:
         alarms = self._alarms
         age = self._cgm.age(step)
-        if self._receiver.crc_errors + self._receiver.malformed > self._crc_errors_seen:
-            self._crc_errors_seen = self._receiver.crc_errors + self._receiver.malformed
+        if self._e2e_errors() > self._crc_errors_seen:
+            self._crc_errors_seen = self._e2e_errors()
             self._last_e2e_error = step
         # a missing sample is told by LimiterBits, and by CgmLost when it matters
         if self._outputs[layout.OUT_LIMITERS] & ~layout.LIMITER_STALE_CGM and state == State.AUTO:
@@ -594,7 +609,7 @@ class Firmware:
         receiver = self._receiver
         self._turn.send(
             "CTRL_Diag",
-            E2eErrorCount=min(receiver.crc_errors + receiver.malformed, 4095),
+            E2eErrorCount=min(self._e2e_errors(), 4095),
             LostFrameCount=min(self._lost_frames(), 4095),
             SequenceErrorCount=min(self._sequence_errors + receiver.sequence_errors + self._refused_by_number(), 1023),
             SaturationCount=min(self._state[layout.SATURATIONS], 1023),
@@ -604,6 +619,9 @@ class Firmware:
 
     def _refused_by_number(self) -> int:
         return self._pump.refused + self._meals.repeated
+
+    def _e2e_errors(self) -> int:
+        return self._receiver.crc_errors + self._receiver.malformed + self._impostors
 
     def _lost_frames(self) -> int:
         return self._receiver.lost + self._lost_unseen
@@ -689,7 +707,7 @@ class Firmware:
             "pram_rate": self._outputs[layout.OUT_PRAM_RATE],
             "iob": self._outputs[layout.OUT_IOB],
             "limiters": self._outputs[layout.OUT_LIMITERS],
-            "e2e_errors": self._receiver.crc_errors + self._receiver.malformed,
+            "e2e_errors": self._e2e_errors(),
             "lost_frames": self._lost_frames(),
             "boots": self._boots,
         }
@@ -718,7 +736,7 @@ class Firmware:
         """Data by identifier: docs/diagnostics.md has the table."""
         major, minor = dbc.protocol_version()
         counters = (
-            self._receiver.crc_errors + self._receiver.malformed,
+            self._e2e_errors(),
             self._lost_frames(),
             self._sequence_errors + self._receiver.sequence_errors + self._refused_by_number(),
             self._state[layout.SATURATIONS],

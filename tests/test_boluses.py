@@ -4,10 +4,12 @@ import random
 from collections.abc import Sequence
 
 import pytest
+from bench import SENT_BY_CTRL
 from pair import TOKENS, Pair, Values
 from pumpbench.calibration import MODES, Tuning
 
 from can_bus import codec
+from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 from firmware_sim.alarms import Code
 from firmware_sim.control import layout
@@ -388,3 +390,17 @@ def test_a_pump_that_accepts_no_bolus_at_all_is_asked_once_and_then_told_as_limi
     limiters = [values["LimiterBits"] for values in pair.all("CTRL_Status")]
     assert limiters[30] & layout.LIMITER_MAX_BOLUS
     assert pair.alarms(Code.DOSE_LIMITED) and pair.ledgers_close()
+
+
+@pytest.mark.parametrize("name", [name for name in SENT_BY_CTRL if name != "SYNC_Done"])
+def test_while_somebody_sends_in_its_place_no_bolus_is_given(name: str) -> None:
+    """Requirement E2E-05: a node never hears itself, so a frame with an id of its own is somebody else's."""
+    pair = Pair("ma", meals=[(10, 60.0), (13, 60.0)], steps=16)
+    forged = Transmitter().frame(name)
+    pair.to_device = lambda name, _, frame: [forged, frame] if name == "CGM_Reading" and pair.plant.step == 10 else None
+    pair.play()
+    steps = [step for step, said, values in pair.heard if said == "PUMP_BolusCmd" and values["BolusOp"] == 2]
+    assert set(steps) == {13}
+    assert [values["E2eErrorCount"] for values in pair.all("CTRL_Diag")][9:12] == [0, 1, 1]
+    assert {values["CtrlAlarmState"] for values in pair.alarms(Code.E2E_FAULT)} >= {1}
+    assert pair.alarms(Code.DOSE_REJECTED)

@@ -12,7 +12,7 @@ from can_bus.lockstep import STEP_SECONDS, Phase
 from firmware_sim.alarms import Code
 from firmware_sim.cgm import ABOVE_RANGE_ACTS_AS, AGE_USABLE, BELOW_RANGE_ACTS_AS, SEQUENCE_MODULUS, Cgm
 from firmware_sim.control.layout import LIMITER_LOW_GLUCOSE
-from firmware_sim.firmware import Firmware, subscriptions
+from firmware_sim.firmware import DIAGNOSTICS, Firmware, subscriptions
 from firmware_sim.ladder import State
 from firmware_sim.pump import Op
 
@@ -368,7 +368,7 @@ def edges(field: Field) -> list[int]:
     return sorted({*near, *powers, *(draw.randrange(field.mask + 1) for _ in range(20))})
 
 
-@pytest.mark.parametrize("name", [name for name in subscriptions() if name != "SYNC_Step"])
+@pytest.mark.parametrize("name", [name for name in subscriptions() if name not in ("SYNC_Step", DIAGNOSTICS)])
 def test_any_code_in_any_field_is_survived(name: str) -> None:
     """CRC and counter are right; only plausibility can catch it."""
     message = codec.message(name)
@@ -409,11 +409,11 @@ def test_a_hundred_thousand_random_frames_change_no_dose() -> None:
     bench, undisturbed = Bench(mode=S2), Bench(mode=S2)
     bench.run(3), undisturbed.run(3)
     draw = random.Random(100)
-    ids = [codec.message(name).can_id for name in subscriptions()]
+    ids = [codec.message(name).can_id for name in subscriptions() if name != DIAGNOSTICS]
     heartbeats = {codec.message(name).can_id for name in subscriptions() if not codec.message(name).data_ids}
     bus = [can_id for can_id in ids if can_id not in heartbeats]
     expected = 0
-    check = codec.Receiver(subscriptions())
+    check = codec.Receiver(name for name in subscriptions() if name != DIAGNOSTICS)
     for k in range(200):
         for _ in range(500):
             can_id = draw.choice((draw.choice(bus), draw.randrange(0x800), draw.getrandbits(29) | CAN_EFF_FLAG))
@@ -434,7 +434,7 @@ def test_a_hundred_thousand_well_protected_random_frames_dose_nothing_above_the_
     """Right id, length, CRC and counter, random content: every message but the token and the calibration's CRC."""
     bench = limited_bench(S2)
     draw = random.Random(101)
-    names = [name for name in subscriptions() if name != "SYNC_Step"]
+    names = [name for name in subscriptions() if name not in ("SYNC_Step", DIAGNOSTICS)]
     states = set()
     counters = dict(bench.transmitter.counters)
     for k in range(100_000):

@@ -684,3 +684,10 @@ def test_every_change_of_state_is_told_in_the_same_step(seed: int, confirming: b
 
 def test_a_device_that_was_not_reset_says_nothing_by_itself() -> None:
     assert Firmware().start() == []
+
+
+def test_an_alarm_that_is_not_in_force_is_not_renewed() -> None:
+    bench = Bench()
+    bench.run(3)
+    bench.firmware._alarms.renew(Code.CGM_LOST)  # type: ignore[attr-defined]
+    assert not bench.step().alarms(Code.CGM_LOST)

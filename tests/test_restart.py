@@ -66,3 +66,35 @@ def test_a_file_that_is_no_memory_is_refused_with_its_name(tmp_path: Path, capsy
     error = capsys.readouterr().err
     assert str(path) in error and "14 bytes" in error and "expected" in error
     assert path.read_bytes() == b"something else"
+
+
+def test_a_firmware_without_a_memory_does_its_run(tmp_path: Path) -> None:
+    url = f"unix:{tmp_path / 'bus'}"
+    plant = subprocess.Popen([sys.executable, "-m", "pumpbench", "plant", "--bus", url, "--host", "--days", "1"])
+    try:
+        wait_for(tmp_path / "bus")
+        done = subprocess.run([sys.executable, "-m", "firmware_sim", "--bus", url], timeout=DEADLINE, check=False)
+        assert done.returncode == 0
+        assert plant.wait(DEADLINE) == 0
+    finally:
+        plant.kill()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        ([], "--bus URL is needed"),
+        (
+            ["--bus", "unix:/nowhere", "--console", "socket://10.0.0.1:99"],
+            "--console: socket://10.0.0.1:99: a socket must",
+        ),
+    ],
+)
+def test_wrong_usage_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], what: str
+) -> None:
+    monkeypatch.delenv("PUMPBENCH_BUS", raising=False)
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    assert what in capsys.readouterr().err
