@@ -131,8 +131,8 @@ def test_balanced_errors_are_those_of_the_residual_mean_square() -> None:
 
 def test_published_example_of_a_randomised_block() -> None:
     values = np.array([[9.3, 9.4, 9.2, 9.7], [9.4, 9.3, 9.4, 9.6], [9.6, 9.8, 9.5, 10.0], [10.0, 9.9, 9.7, 10.2]])
-    # Montgomery, Design and Analysis of Experiments, hardness testing (four tips on four coupons): SS_error 0.0800 with 9
-    # degrees of freedom
+    # Montgomery, Design and Analysis of Experiments, hardness testing (four tips on four coupons): SS_error 0.0800,
+    # 9 degrees of freedom
     fitted = statistics.fit(pd.DataFrame(values, columns=["s1", "s2", "s3", "s4"]))
     assert fitted.covariance.loc["s1", "s1"] * 4 == pytest.approx(0.0800 / 9, abs=1e-6)
 

@@ -34,6 +34,14 @@ TABLE2_METRICS: Final = (
     "pramlintide_ug_per_day",
 )
 
+DOSES: Final = {
+    "s1": ("lambda_ug", "bolus λ", "µg"),
+    "s2": ("ratio_ug_per_u", "ratio ρ", "µg/U"),
+    "s3": ("phi_ug", "bolus φ", "µg"),
+    "s4": ("ratio_ug_per_u", "ratio δ", "µg/U"),
+}
+"""Per strategy: the column of the results that is swept in its tuning, its name in the paper, its unit."""
+
 ROUNDING: Final = 0.05 + 0.05 + 0.005
 """Most by which a difference of Table 3 can differ from that of two means of Table 2 through rounding alone."""
 
@@ -68,6 +76,12 @@ def table3(path: Path = DATA / "paper_table3.csv") -> pd.DataFrame:
 def text_numbers(path: Path = DATA / "paper_text.csv") -> pd.DataFrame:
     """Contrasts, means and chosen doses in the paper's text only; `low`, `high`, `sd` NaN where not given."""
     return _read(path, ("value",))
+
+
+def chosen_dose(strategy: str) -> float:
+    """The dose (ug) or ratio (ug/U) that the paper chose for a strategy."""
+    table = text_numbers()
+    return float(table.loc[(table["kind"] == "chosen") & (table["first"] == strategy), "value"].iloc[0])
 
 
 def inconsistencies() -> pd.DataFrame:

@@ -349,6 +349,20 @@ def compare(table: pd.DataFrame) -> pd.DataFrame:
     return out.drop(columns="paper_source")
 
 
+def compare_cells(table: pd.DataFrame) -> pd.DataFrame:
+    """The cells of Table 2 beside the paper's: low and high are the normal 95 % interval of our mean over patients.
+
+    agrees: the paper's mean, printed with one decimal, lies within that interval. Levels depend on the cohort, which is
+    not the paper's; the contrasts are the test.
+    """
+    out = table.merge(paper.table2(), on=["mode", "metric"], suffixes=("", "_paper"), validate="one_to_one")
+    out = out.rename(columns={"mean_paper": "paper_mean", "sd_paper": "paper_sd"}).drop(columns="source")
+    half = QUANTILE * out["sd"] / np.sqrt(out["patients"])
+    out["low"], out["high"] = out["mean"] - half, out["mean"] + half
+    out["agrees"] = out["paper_mean"].between(out["low"] - 0.05, out["high"] + 0.05)
+    return out
+
+
 def rms_distance(table: pd.DataFrame, metric: str = "tir_70_180") -> float:
     """Root mean square, over the modes that were run, of our mean minus that of Table 2 (percent points)."""
     both = table[table["metric"] == metric].merge(paper.table2(), on=["mode", "metric"], suffixes=("", "_paper"))
@@ -441,6 +455,28 @@ between groups that clinicians call meaningful."""
 TBR_MARGIN: Final = 0.5
 """Percent points of mean time below 70 mg/dL within which two tunings count as similar; choice, an eighth of the
 consensus limit of 4 %."""
+
+
+def sweeps_thresholds(tuning: pd.DataFrame) -> pd.Series:
+    """Which tuning runs belong to the search for z1, z2, z3 of strategy 1 (those with a z1)."""
+    return tuning["z1"].notna() if "z1" in tuning else pd.Series(False, index=tuning.index)
+
+
+def dose_runs(tuning: pd.DataFrame, strategy: str) -> pd.DataFrame:
+    """The tuning runs that sweep the dose or ratio of a strategy.
+
+    Raises:
+        ValueError: the dose or ratio is missing in a run.
+    """
+    part = tuning[(tuning["mode"] == strategy) & ~sweeps_thresholds(tuning)]
+    column = paper.DOSES[strategy][0]
+    if len(part):
+        check_columns(part, [column])
+        if part[column].isna().any():
+            raise ValueError(
+                f"results: tuning of {strategy}: no {column} in {part['label'][part[column].isna()].iloc[0]}"
+            )
+    return part
 
 
 @dataclass(frozen=True)

@@ -30,16 +30,16 @@ TABLE3_COLUMNS: Final = [
 def write_table(path: Path, table: pd.DataFrame) -> None:
     """A table as CSV: numbers with four decimals, p with four digits, true/false, nothing where there is no number."""
     text = pd.DataFrame({str(name): [_cell(str(name), value) for value in table[name]] for name in table})
-    write_text(path, text.to_csv(index=False, lineterminator="\n"))
+    write_file(path, text.to_csv(index=False, lineterminator="\n").encode())
 
 
-def write_text(path: Path, text: str) -> None:
-    """The file whole or not at all, UTF-8; the folder is made."""
+def write_file(path: Path, content: bytes) -> None:
+    """The file whole or not at all; the folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, name = tempfile.mkstemp(prefix=path.name, suffix=".partial", dir=path.parent)
     try:
-        with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
         Path(name).chmod(0o644)
         Path(name).replace(path)
     except OSError:
@@ -119,7 +119,6 @@ def write_tables(folder: Path, runs: pd.DataFrame) -> list[Path]:
 def selections(runs: pd.DataFrame) -> Mapping[str, statistics.Selection]:
     """What the paper's rule chooses per strategy and, as "s1 thresholds", for z1, z2, z3 of the tuning runs."""
     tuning = runs[runs["part"] == "tuning"]
-    swept = tuning["z1"].notna() if "z1" in tuning else pd.Series(False, index=tuning.index)
-    parts = {strategy: tuning[(tuning["mode"] == strategy) & ~swept] for strategy in paper.STRATEGIES}
-    parts["s1 thresholds"] = tuning[swept]
+    parts = {strategy: statistics.dose_runs(tuning, strategy) for strategy in paper.STRATEGIES}
+    parts["s1 thresholds"] = tuning[statistics.sweeps_thresholds(tuning)]
     return {name: statistics.select(part) for name, part in parts.items() if len(part)}
