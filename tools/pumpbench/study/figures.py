@@ -81,11 +81,11 @@ def write_figures(
     six: CurveSet | None = None,
     meals: Sequence[Meal] = (),
 ) -> dict[str, Path]:
-    """All figures there are data for, by name: contrasts, tuning_s1 ... tuning_s4, strategies_over_time,
-    ratio_6_and_10.
+    """All figures there are data for, by name.
 
-    `curves` and `meals` are those of the validation, `six` the curves of strategies 2 and 4 with 6 ug/U. Of several
-    seeds the first is drawn, since an average over seeds would hide how a run looks.
+    They are contrasts, tuning_s1 to tuning_s4, strategies_over_time and ratio_6_and_10. `curves` and `meals` are those
+    of the validation, `six` the curves of strategies 2 and 4 with 6 ug/U. Of several seeds the first is drawn, since an
+    average over seeds would hide how a run looks.
     """
     figures = {"contrasts": contrasts_figure(statistics.compare(statistics.contrasts(statistics.validation(runs))))}
     tuning = runs[runs["part"] == "tuning"]

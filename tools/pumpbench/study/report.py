@@ -98,7 +98,7 @@ def write_report(
         cells={(row["mode"], row["metric"]): row for row in cells.to_dict("records")},
         text_contrasts=statistics.text_contrasts(runs).to_dict("records"),
         differing=list(_differing(contrasts, cells, explanations)),
-        inconsistencies=paper.inconsistencies(),
+        inconsistencies=_inconsistencies(),
         selections=_selections(runs),
         tir_margin=statistics.TIR_MARGIN,
         tbr_margin=statistics.TBR_MARGIN,
@@ -120,7 +120,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": _number, "pvalue": _p, "cell": _cell}
+    environment.filters |= {"number": _number, "pvalue": _p, "cell": _cell, "text": _text}
     return environment
 
 
@@ -142,6 +142,14 @@ def _cell(value: Any) -> str:
     if isinstance(value, (float, np.floating)):
         return _number(float(value), 2)
     return str(value)
+
+
+def _text(name: str) -> str:
+    """`s2 ratio=10` as S2 with 10 µg/U, `ma` as MA."""
+    mode, _, rest = name.partition(" ")
+    return mode.upper() + (
+        f" with {rest.removeprefix('ratio=')} µg/U" if rest.startswith("ratio=") else f" {rest}" * bool(rest)
+    )
 
 
 def _duration(seconds: float | None) -> str:
@@ -173,15 +181,29 @@ def _warnings(alone: pd.DataFrame, contrasts: pd.DataFrame) -> Iterator[str]:
     shortest = float(alone["days"].min()) if "days" in alone else PAPER_DAYS
     if patients < PAPER_PATIENTS or shortest < PAPER_DAYS:
         yield (
-            f"Less than the paper’s study: {patients} of its {PAPER_PATIENTS} patients, {shortest:g} of its {PAPER_DAYS} "
-            "days. Differences and intervals are not to be expected to agree."
+            f"Less than the paper’s study: {patients} of its {PAPER_PATIENTS} patients, {shortest:g} of its "
+            f"{PAPER_DAYS} days. Differences and intervals are not to be expected to agree."
         )
     absent = [mode.upper() for mode in paper.MODES if mode not in set(alone["mode"])]
     if absent:
         yield f"Not run: {', '.join(absent)}."
     notes = contrasts.loc[contrasts["note"] != "", ["metric", "note"]]
     for note, rows in notes[~notes["note"].str.startswith("no runs of")].groupby("note"):
-        yield f"{note} ({', '.join(sorted({figures.NAMES[metric] for metric in rows['metric']}))}, {len(rows)} contrasts)."
+        metrics = ", ".join(figures.NAMES[metric] for metric in paper.CONTRAST_METRICS if metric in set(rows["metric"]))
+        yield f"{note[0].upper()}{note[1:]}: {len(rows)} contrasts of {metrics}."
+
+
+def _inconsistencies() -> pd.DataFrame:
+    table = paper.inconsistencies()
+    return pd.DataFrame(
+        {
+            "contrast": [f"{row.strategy.upper()} − {row.comparator.upper()}" for row in table.itertuples()],
+            "metric": [figures.NAMES[metric] for metric in table["metric"]],
+            "Table 3": table["difference"],
+            "means of Table 2": [_number(value, 1) for value in table["of_means"]],
+            "beyond rounding": table["excess"],
+        }
+    )
 
 
 def _selections(runs: pd.DataFrame) -> list[dict[str, Any]]:
@@ -199,22 +221,30 @@ def _selections(runs: pd.DataFrame) -> list[dict[str, Any]]:
 def _differing(
     contrasts: pd.DataFrame, cells: pd.DataFrame, explanations: Mapping[str, str]
 ) -> Iterator[dict[str, str]]:
-    """Contrasts that disagree in sign or significance or lie outside the paper's interval, and cells off its mean."""
-    for row in contrasts.to_dict("records"):
+    """Contrasts that disagree in sign or significance or lie outside the paper's interval, and cells off its mean.
+
+    What was not run is not among them: the warnings on top name it.
+    """
+    odd = paper.inconsistencies().set_index(["comparator", "strategy", "metric"])["of_means"].to_dict()
+    for row in contrasts[contrasts["difference"].notna()].to_dict("records"):
         hows = [] if row["agrees_sign"] else ["sign"]
         hows += [] if row["agrees_significance"] else ["significance"]
         hows += [] if row["inside_interval"] else ["outside the paper’s interval"]
         if not hows:
             continue
-        known = not np.isnan(row["difference"])
-        metric, mode = row["metric"], row["strategy"]
+        if row["robust_agrees"] and not row["agrees"]:
+            hows.append("agrees with the robust interval")
+        metric, mode, comparator = row["metric"], row["strategy"], row["comparator"]
+        why = [_explained(explanations, f"{comparator} {mode} {metric}", f"{mode} {metric}", metric)]
+        if (comparator, mode, metric) in odd:
+            why.append(f"The means of the paper’s Table 2 differ by {_number(odd[comparator, mode, metric], 1)} here.")
         yield {
-            "what": f"S{mode[1]} − {row['comparator'].upper()}",
+            "what": f"S{mode[1]} − {comparator.upper()}",
             "metric": metric,
             "ours": f"{_number(row['difference'], 2)}{'*' if row['p'] < statistics.LEVEL else ''}",
             "theirs": f"{_number(row['paper_difference'], 2)}{'*' if row['paper_significant'] else ''}",
-            "how": ", ".join(hows) if known else row["note"],
-            "why": _explained(explanations, f"{row['comparator']} {mode} {metric}", f"{mode} {metric}", metric),
+            "how": ", ".join(hows) if row["patients"] > 1 else "one patient",
+            "why": " ".join(why).strip(),
         }
     for row in cells[~cells["agrees"]].to_dict("records"):
         yield {

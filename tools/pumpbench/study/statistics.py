@@ -518,8 +518,8 @@ def select(tuning: pd.DataFrame, *, tir_margin: float = TIR_MARGIN, tbr_margin: 
     why = (
         f"{chosen['label']}: {chosen['tir_70_180']:.2f} % in range and {chosen['tbr_70']:.2f} % below 70 with "
         f"{chosen['pramlintide_ug_per_day']:.1f} µg/day, the least pramlintide of {len(order)} of {len(table)} tunings "
-        f"within {tir_margin:g} points of the longest time in range ({best['label']}: {best['tir_70_180']:.2f} %) and "
-        f"{tbr_margin:g} points of the lowest time below 70 among them"
+        f"within {tir_margin:.1f} points of the longest time in range ({best['label']}: {best['tir_70_180']:.2f} %) "
+        f"and {tbr_margin:.1f} points of the lowest time below 70 among them"
     )
     return Selection(str(chosen["label"]), why, table.reset_index(drop=True))
 
