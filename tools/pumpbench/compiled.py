@@ -6,9 +6,11 @@ The modules themselves stay as they are, so a plain firmware and a compiled core
 """
 
 import functools
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
@@ -18,7 +20,39 @@ from firmware_sim.control import core
 
 Words = npt.NDArray[np.int64]
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
 _ROOM = "firmware_sim.control"
+
+
+def helper(function: Function) -> Function:
+    """Compile a function that only compiled code calls; it becomes a part of its caller, on disk too."""
+    return cast(Function, numba.njit(function))
+
+
+def kept_on_disk(sources: Iterable[Path]) -> Callable[[Function], Function]:
+    """Compile a function that Python calls, and keep its machine code beside its source for the next process.
+
+    numba compiles again when that one file changes, but the code of everything the function calls, and the value of
+    every constant, lies in it too: it is good for just these bytes of all of `sources` (files, or folders of them).
+    """
+    digest = hashlib.sha256()
+    for source in sources:
+        for file in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+            digest.update(file.read_bytes())
+    stamp = digest.digest()
+
+    def decorate(function: Function) -> Function:
+        try:
+            dispatcher = numba.njit(cache=True)(function)
+        except RuntimeError:  # nowhere to write, as in a read-only container
+            return helper(function)
+        cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if cache_file is not None:  # None under NUMBA_DISABLE_JIT
+            cache_file._source_stamp = (cache_file._source_stamp, stamp)
+        return cast(Function, dispatcher)
+
+    return decorate
 
 
 class _Twins:
@@ -33,6 +67,7 @@ class _Twins:
         if plain not in self._functions:
             names = _names(plain)
             scope = {name: self._twin(value, names) for name, value in plain.__globals__.items() if name in names}
+            scope["__name__"] = plain.__module__  # numba's cache on disk looks a function up by its module
             copy = FunctionType(plain.__code__, scope, plain.__name__, plain.__defaults__, plain.__closure__)
             self._functions[plain] = numba.njit(copy)
         return self._functions[plain]
@@ -59,6 +94,16 @@ def _names(function: FunctionType) -> set[str]:
 
 
 @functools.cache
+def _control() -> _Twins:
+    return _Twins()
+
+
+def twin(plain: Function) -> Function:
+    """The compiled twin of any function of `firmware_sim.control`."""
+    return cast(Function, _control().function(cast(FunctionType, plain)))
+
+
+@functools.cache
 def control_step() -> Callable[[Words, Words, Words, Words], None]:
     """The compiled `firmware_sim.control.core.control_step`; the first call in a process takes seconds to compile.
 
@@ -66,5 +111,4 @@ def control_step() -> Callable[[Words, Words, Words, Words], None]:
         A function of the arrays state, parameters, inputs and outputs, int64 and laid out as in
         `firmware_sim.control.layout`. It can also be called from other functions that numba compiles.
     """
-    compiled: Callable[[Words, Words, Words, Words], None] = _Twins().function(core.control_step)  # type: ignore[arg-type]
-    return compiled
+    return cast(Callable[[Words, Words, Words, Words], None], twin(core.control_step))
