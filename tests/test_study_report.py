@@ -214,10 +214,12 @@ def test_one_patient_one_day_three_modes(tmp_path: Path) -> None:
 
 def test_two_patients_have_intervals(tmp_path: Path) -> None:
     runs = synthetic_runs()
-    few = runs[(runs["part"] == "validation") & runs["patient"].isin(["adult#001", "adult#002"])]
+    few = runs[(runs["part"] == "validation") & runs["patient"].isin(["adult#001", "adult#002"])].copy()
+    few.iloc[3, few.columns.get_loc("limiter_steps")] = 7.0
     text = report.write_report(tmp_path, report.ResultSet("two", few)).read_text(encoding="utf-8")
     assert "2 of its 10 patients, 14 of its 14 days" in text
     assert "could be judged" not in text
+    assert "limits acted in 1 of 28 runs (7 steps)" in text
     assert "No curves were given." in text
 
 

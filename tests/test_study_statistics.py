@@ -59,6 +59,12 @@ def test_the_papers_tables_are_whole() -> None:
     assert ((table["low"] <= table["difference"]) & (table["difference"] <= table["high"])).all()
 
 
+def test_the_papers_times_add_up() -> None:
+    wide = paper.table2().pivot(index="mode", columns="metric", values="mean")
+    assert (wide[["tbr_70", "tir_70_180", "tar_180"]].sum(axis=1) - 100).abs().max() < 0.1501
+    assert (wide["tar_250"] <= wide["tar_180"]).all()
+
+
 def test_the_papers_asterisks_are_its_intervals() -> None:
     table = paper.table3()
     assert (table["significant"] == ((table["low"] > 0) | (table["high"] < 0))).all()
@@ -348,6 +354,10 @@ def test_contrasts_of_the_text() -> None:
     row = table.iloc[2]
     assert row["value"] == pytest.approx(by_hand.mean())
     assert row["high"] - row["value"] == pytest.approx(Z * by_hand.std() / math.sqrt(10))
+    fewer = runs[(runs["part"] != "dose_ratio") | (runs["seed"] == 2)]
+    assert statistics.text_contrasts(fewer).iloc[2]["value"] == pytest.approx(
+        statistics.text_contrasts(runs[runs["seed"] == 2]).iloc[2]["value"]
+    )
     without = statistics.text_contrasts(runs[runs["part"] == "validation"])
     assert without["note"].tolist() == [
         *("", "", "no runs of s2 ratio=10 and s2 ratio=6", "no runs of s4 ratio=10 and s4 ratio=6"),

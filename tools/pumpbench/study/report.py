@@ -187,6 +187,12 @@ def _warnings(alone: pd.DataFrame, contrasts: pd.DataFrame) -> Iterator[str]:
     absent = [mode.upper() for mode in paper.MODES if mode not in set(alone["mode"])]
     if absent:
         yield f"Not run: {', '.join(absent)}."
+    touched = alone[alone["limiter_steps"] > 0] if "limiter_steps" in alone else alone.iloc[:0]
+    if len(touched):
+        yield (
+            f"The firmware’s limits acted in {len(touched)} of {len(alone)} runs ({touched['limiter_steps'].sum():.0f} "
+            "steps): the paper has none."
+        )
     notes = contrasts.loc[contrasts["note"] != "", ["metric", "note"]]
     for note, rows in notes[~notes["note"].str.startswith("no runs of")].groupby("note"):
         metrics = ", ".join(figures.NAMES[metric] for metric in paper.CONTRAST_METRICS if metric in set(rows["metric"]))

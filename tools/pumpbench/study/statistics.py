@@ -400,7 +400,8 @@ def text_contrasts(runs: pd.DataFrame) -> pd.DataFrame:
     """What the paper says in its text only: MA against SMA and NMA, 10 against 6 ug/U, doses at 6 ug/U.
 
     `runs` holds all parts. The 6 ug/U are the runs of part dose_ratio; the 10 ug/U those of that part if it has them,
-    otherwise the validation runs, whose ratio is the chosen one. A ratio contrast is a model of its own with two modes.
+    otherwise the validation runs, whose ratio is the chosen one, both with the seeds they share. A ratio contrast is
+    a model of its own with two modes.
     """
     alone = validation(runs)
     ratios = {mode: _ratio_runs(runs, alone, mode) for mode in ("s2", "s4")}
@@ -442,6 +443,9 @@ def _ratio_runs(runs: pd.DataFrame, alone: pd.DataFrame, mode: str) -> pd.DataFr
         six = ten = part
     if ten.empty and len(six):
         ten = alone[alone["mode"] == mode]
+    if len(six) and len(ten):  # the comparison may have been run with fewer seeds than the validation
+        shared = set(six["seed"]) & set(ten["seed"])
+        six, ten = six[six["seed"].isin(shared)], ten[ten["seed"].isin(shared)]
     named = [table.assign(mode=f"{mode} ratio={ratio:g}") for table, ratio in ((six, low), (ten, high)) if len(table)]
     return pd.concat(named, ignore_index=True) if named else part
 
