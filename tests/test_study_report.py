@@ -281,6 +281,13 @@ def test_bands_are_quartiles_over_the_patients_of_the_first_seed() -> None:
     noon = band[np.isclose(band[:, 0], 12.0)][:, 1]
     assert sorted(noon) == pytest.approx(np.percentile(rows[:, 144], [25, 75]))
     assert bottom.get_xlim() == (0, 24)
+    for run in curves.values():
+        run.cgm[-1] = np.nan
+        run.plasma_insulin[:] = np.nan
+    figure = figures.strategies_figure(curves)
+    assert [axis.get_ylabel() for axis in figure.axes] == ["CGM [mg/dL]", "plasma pramlintide\n[pmol/L]"]
+    last = figure.axes[0].lines[0].get_ydata()
+    assert np.isnan(last).tolist() == [False] * 288 + [True]
     assert [text.get_text() for text in top.texts] == ["65 g", "48 g", "41 g"]  # the last meal is on the second day
 
 

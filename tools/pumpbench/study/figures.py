@@ -60,7 +60,7 @@ TUNING_PANELS: Final = ("tir_70_180", "tar_180", "tbr_70", "pramlintide_ug_per_d
 
 @dataclass(frozen=True)
 class Curves:
-    """Samples of one run every 5 min from midnight of its first day on: mg/dL, pmol/L, pmol/L."""
+    """Samples of one run every 5 min from midnight of its first day on: mg/dL, pmol/L, pmol/L; NaN: no reading."""
 
     cgm: Array
     plasma_insulin: Array
@@ -207,10 +207,17 @@ def strategies_figure(curves: CurveSet, meals: Sequence[Meal] = (), hours: float
     """CGM with meals, plasma pramlintide and plasma insulin of NMA, strategies 1 and 2: medians and quartile bands."""
     modes = [mode for mode in STYLES if any(mode == known for _, known, _ in curves)]
     hours = _length(curves, hours)
-    figure, axes = _figure(9.6, 7.6, 3, sharex=True, height_ratios=[1.5, 1, 1])
-    names = ("cgm", "plasma_pramlintide", "plasma_insulin")
-    labels = ("CGM [mg/dL]", "plasma pramlintide\n[pmol/L]", "plasma insulin\n[pmol/L]")
-    for axis, name, label in zip(axes.flat, names, labels, strict=True):
+    panels = {
+        "cgm": "CGM [mg/dL]",
+        "plasma_pramlintide": "plasma pramlintide\n[pmol/L]",
+        "plasma_insulin": "plasma insulin\n[pmol/L]",
+    }
+    # runs over a bus do not tell what is in the patient's plasma
+    known = [name for name in panels if any(np.isfinite(getattr(run, name)).any() for run in curves.values())]
+    heights = [1.5 if name == "cgm" else 1.0 for name in known]
+    figure, axes = _figure(9.6, 2.0 * sum(heights) + 0.6, len(known), sharex=True, height_ratios=heights)
+    for axis, name in zip(axes.flat, known, strict=True):
+        label = panels[name]
         for mode in modes:
             colour, style, text = STYLES[mode]
             _band(axis, _stack(curves, mode, name, hours), colour, style, text)
@@ -243,8 +250,8 @@ def ratio_figure(ten: CurveSet, six: CurveSet, meals: Sequence[Meal] = (), hours
 
 
 def _length(curves: CurveSet, hours: float) -> float:
-    """The hours asked for, or those of the longest run."""
-    return min(hours, max(len(run.cgm) - 1 for run in curves.values()) * SAMPLE_MINUTES / 60)
+    """The hours asked for, or those of the longest run, in whole hours."""
+    return min(hours, round(max(len(run.cgm) for run in curves.values()) * SAMPLE_MINUTES / 60))
 
 
 def _stack(curves: CurveSet, mode: str, name: str, hours: float) -> Array:
@@ -257,7 +264,9 @@ def _stack(curves: CurveSet, mode: str, name: str, hours: float) -> Array:
 
 def _band(axis: Any, rows: Array, colour: str, style: Any, label: str) -> None:
     hours = np.arange(rows.shape[1]) * SAMPLE_MINUTES / 60
-    low, middle, high = np.nanpercentile(rows, [25, 50, 75], axis=0)
+    low, middle, high = bands = np.full((3, rows.shape[1]), np.nan)
+    known = ~np.isnan(rows).all(axis=0)  # at some instants no patient has a reading
+    bands[:, known] = np.nanpercentile(rows[:, known], [25, 50, 75], axis=0)
     if len(rows) > 1:
         axis.fill_between(hours, low, high, color=colour, alpha=0.18, lw=0)
     axis.plot(hours, middle, color=colour, ls=style, lw=2.0, label=label)
