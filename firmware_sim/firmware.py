@@ -477,12 +477,12 @@ class Firmware:
             self._pump.status(self._status, step)
         pramlintide = self._pump.pramlintide(self._totals)
         basal = self._calibration.parameters[layout.BASAL]
-        delivered = self._pump.delivered(self._totals, step, basal)
+        bolus = sum(raw * 10 for drug, raw in self._boluses.open_step(step) if drug == Drug.INSULIN)
+        delivered = self._pump.delivered(self._totals, step, basal, bolus)
         self._status = None
         self._totals = None
         self._insulin_day.add(max(delivered, 0), step)
         self._pram_day.add(pramlintide, step)
-        bolus = sum(raw * 10 for drug, raw in self._boluses.open_step(step) if drug == Drug.INSULIN)
         return delivered, bolus
 
     def _control(self, state: State, glucose: int, delivered: int, bolus: int) -> None:

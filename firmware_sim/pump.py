@@ -115,16 +115,17 @@ class Pump:
             return 0
         return total if rebooted else total - last
 
-    def delivered(self, totals: dict[str, int] | None, step: int, basal: int) -> int:
+    def delivered(self, totals: dict[str, int] | None, step: int, basal: int, bolus: int = 0) -> int:
         """Insulin delivered since the last step.
 
-        What a missing total leaves open is estimated from the command in force and settled when the next one comes, so
-        that the sum over all steps is always what the pump says.
+        What a missing total leaves open is estimated from the command in force and the boluses the pump has told of,
+        and settled when the next one comes, so that the sum over all steps is always what the pump says.
 
         Args:
             totals: decoded PUMP_Delivered of this step, or None.
             step: k.
             basal: scheduled rate in 0.001 U/h.
+            bolus: what newly turned out to be delivered of boluses, mU.
 
         Returns:
             mU; -1 while no total has ever come.
@@ -134,7 +135,7 @@ class Pump:
         if self._confirmed_total is None:
             return -1
         milliunits = basal if self._commanded_rate is None else self._commanded_rate * 5
-        estimate = round_divide(milliunits, 12)
+        estimate = round_divide(milliunits, 12) + bolus
         self._estimated += estimate
         return estimate
 

@@ -404,3 +404,12 @@ def test_while_somebody_sends_in_its_place_no_bolus_is_given(name: str) -> None:
     assert [values["E2eErrorCount"] for values in pair.all("CTRL_Diag")][9:12] == [0, 1, 1]
     assert {values["CtrlAlarmState"] for values in pair.alarms(Code.E2E_FAULT)} >= {1}
     assert pair.alarms(Code.DOSE_REJECTED)
+
+
+def test_a_bolus_stays_on_board_although_the_total_that_holds_it_is_lost() -> None:
+    """PUMP_BolusState settles the bolus in a step whose PUMP_Delivered never came (found by hostile sequences)."""
+    pair = Pair("ma", meals=[(10, 60.0)], steps=16)
+    pair.to_device = lambda name, *_: [] if name == "PUMP_Delivered" and pair.plant.step == 11 else None
+    pair.play()
+    (dose,) = pair.commits(INSULIN).values()
+    assert all(iob > 0.85 * dose for iob in pair.iob()[10:14])

@@ -634,6 +634,14 @@ class Restarting:
         status = {"CtrlMode": mode, "CtrlState": 1, "InsulinOnBoard": iob, "LimiterBits": 0, "LastMealId": meal}
         self.monitor.watch([token, self.device.frame("CTRL_Status", **status)])
 
+    def bolus(self, dose: int) -> None:
+        fields = {"BolusHormone": 1, "BolusOp": 2, "BolusId": 3, "BolusUntilStep": self.step + 1, "InsulinBolus": dose}
+        self.monitor.watch([self.device.frame("PUMP_BolusCmd", **fields)])
+
+    def delivered(self, dose: int) -> None:
+        fields = {"BolusStateHormone": 1, "BolusPhase": 3, "BolusStateId": 3, "BolusProgrammedRaw": dose}
+        self.monitor.watch([self.plant.frame("PUMP_BolusState", BolusDeliveredRaw=dose, **fields)])
+
     def boots(self) -> None:
         self.device = codec.Transmitter()
         boot = self.device.frame("HB_CTRL", NmtCtrl=0, ToggleCtrl=0, ResetCauseCtrl=1, BootCtrl=1)
@@ -664,6 +672,52 @@ def test_h8_what_a_device_forgets_over_a_reset(after: dict[str, int], lost: int)
     bus.says(**after)
     bus.says(**after)
     assert bus.lost == lost
+
+
+@pytest.mark.parametrize(
+    ("told", "iob", "lost"),
+    [
+        (False, 400, 0),  # counted twice as long as the device cannot know: by the total, and as perhaps still to come
+        (False, 249, 1),  # less than what the total says is a loss
+        (True, 400, 0),
+        (True, 249, 1),
+        (True, 0, 1),
+    ],
+)
+def test_h8_a_bolus_that_is_not_settled_may_be_counted_twice_but_not_forgotten(told: bool, iob: int, lost: int) -> None:
+    bus = Restarting()
+    bus.says(iob=0)
+    bus.bolus(400)
+    bus.says(iob=800)
+    bus.boots()
+    if told:
+        bus.delivered(400)
+    bus.says(iob=iob)
+    assert bus.lost == lost
+
+
+def test_h8_what_a_device_heard_just_before_a_reset_it_may_have_to_hear_again() -> None:
+    bus = Restarting()
+    bus.says(iob=0)
+    bus.bolus(400)
+    bus.says(iob=400)
+    bus.delivered(400)
+    bus.boots()
+    bus.says(iob=800)
+    bus.boots()
+    bus.delivered(400)
+    bus.says(iob=400)
+    assert bus.lost == 0
+
+
+def test_h8_a_bolus_that_came_to_nothing_is_no_loss() -> None:
+    bus = Restarting()
+    bus.says(iob=0)
+    bus.bolus(400)
+    bus.says(iob=400)
+    bus.boots()
+    bus.says(iob=0)
+    assert bus.lost == 0
 
 
 def test_without_a_reset_nothing_is_lost_and_a_mode_that_was_asked_for_is_none() -> None:

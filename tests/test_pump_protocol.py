@@ -91,3 +91,13 @@ def test_the_rate_in_force_is_kept_over_a_reset(op: Op, rate: int) -> None:
     pump = Pump()
     command(pump, op, 240)
     assert pump.save()[-1] == rate
+
+
+def test_a_bolus_the_pump_told_of_counts_although_its_total_is_missing() -> None:
+    pump = Pump()
+    totals = {"PumpBootCount": 0, "InsulinTotal": 500, "PramTotal": 0}
+    pump.delivered(totals, 0, BASAL)
+    command(pump, Op.SET_RATE, 240)
+    assert pump.delivered(None, 1, BASAL, 1600) == 100 + 1600
+    assert pump.delivered({**totals, "InsulinTotal": 500 + 1800}, 2, BASAL) == 100
+    assert pump.delivered({**totals, "InsulinTotal": 500 + 3600}, 3, BASAL, 1700) == 1800  # the total has it already
