@@ -5,10 +5,14 @@ per second divided by the frames of a step. A ratio above 1 is the gain of handi
 `closed-loop/BUS/exchange` stands beside the bare exchange of those batches, the same number of frames in both
 directions between the same number of processes, prebuilt bytes on raw sockets, nothing packed, checked, integrated or
 decided: what is missing to 1 is what plant, firmware and codec cost. The ceiling of the loop in one process is the
-plant alone. Beside simglucose (`plant/vs-simglucose`) the "ceiling" is the peer: see `simglucose_peer`.
+plant alone, and so is that of the compiled loop of campaigns (`closed-loop/compiled`, whole cases with everything
+random drawn anew per seed): it may lie above 1, for it calls its plant from machine code. `closed-loop/compiled/2` is
+the same from two processes at once, beside twice one process: what is missing to 1 is what they take from each other.
+Beside simglucose (`plant/vs-simglucose`) the "ceiling" is the peer: see `simglucose_peer`.
 """
 
 import json
+import multiprocessing
 import subprocess
 import sys
 import tempfile
@@ -25,6 +29,8 @@ from plant_server.mechanism import SUBSTEPS
 from pumpbench import rig
 from pumpbench.benchmark import simglucose_peer
 from pumpbench.benchmark.round_trips import CEILING_OF, Figure, measure, round_trips, vcan_available
+from pumpbench.calibration import MODES
+from pumpbench.closed_loop import Case, simulate
 from pumpbench.trace import decode
 
 PATIENT = "adult#002"
@@ -75,8 +81,10 @@ def _figure(name: str, values: list[float], ceilings: list[float]) -> Figure:
 def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
     """Patient-days per second of whole runs on one kind of bus: `inproc`, `hub` or `vcan`, recorder listening.
 
-    Start-up and the writing of the run folder are left out.
+    Start-up and the writing of the run folder are left out. `compiled` is the loop without a bus.
     """
+    if kind == "compiled":
+        return compiled_loop(days=days, runs=runs)
     bus = {"vcan": "socketcan:vcan0"}.get(kind, kind)
     values, ceilings, exchanges = [], [], []
     with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory:
@@ -103,6 +111,42 @@ def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
         return [_figure("closed-loop/inproc", values, [plant_alone(days=20, runs=3)[0]["value"]])]
     name = f"closed-loop/{kind}"
     return [_figure(name, values, ceilings), _figure(f"{name}/exchange", values, exchanges)]
+
+
+def compiled_loop(*, days: int = 14, runs: int = 5) -> list[Figure]:
+    """Patient-days per second of the compiled loop, on one core and on two.
+
+    A run is one patient and one seed in all seven modes, from the case to its metrics; only the machine code is there
+    already.
+    """
+    _seven_modes((0, 1))
+    values = [_rate(seed, days) for seed in range(1, runs + 1)]
+    ceilings = [plant_alone(days=20, runs=3)[0]["value"]]
+    context = multiprocessing.get_context("spawn")
+    both = []
+    with context.Pool(2, initializer=_seven_modes, initargs=((0, 1),)) as pool:
+        pool.map(_seven_modes, [(0, 1)] * 8, chunksize=1)  # both processes are up
+        for seed in range(runs + 1, 3 * runs + 1, 2):
+            start = time.perf_counter()
+            pool.map(_seven_modes, [(seed, days), (seed + 1, days)], chunksize=1)
+            both.append(2 * len(MODES) * days / (time.perf_counter() - start))
+    return [
+        _figure("closed-loop/compiled", values, ceilings),
+        _figure("closed-loop/compiled/2", both, [2 * value for value in values]),
+    ]
+
+
+def _seven_modes(run: tuple[int, int]) -> None:
+    """One patient and one seed in every mode; `run` is the seed and the days."""
+    seed, days = run
+    for mode in MODES:
+        simulate(Case(PATIENT, mode=mode, seed=seed, days=days)).metrics()
+
+
+def _rate(seed: int, days: int) -> float:
+    start = time.perf_counter()
+    _seven_modes((seed, days))
+    return len(MODES) * days / (time.perf_counter() - start)
 
 
 def _frames_per_step(folder: Path) -> tuple[int, int]:
@@ -132,6 +176,7 @@ def all_figures(*, quick: bool, only_vcan: bool = False, peers: bool = True) -> 
             *closed_loop("vcan", days=1, runs=min(runs, 3)),
         ]
     figures = plant_alone(days=10 if quick else 100, runs=runs)
+    figures += closed_loop("compiled", days=2 if quick else 14, runs=runs)
     if peers:
         figures += simglucose_peer.compare(runs=1 if quick else 3, days=10 if quick else 100)
     figures += round_trips(["hub"], steps=steps, runs=runs)

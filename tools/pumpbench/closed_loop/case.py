@@ -5,9 +5,8 @@ is the same run. What depends on patient, seed, sensor and scenario alone is kep
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from firmware_sim.calibration import SET_CRC_INDEX, Calibration, parameter_names
 from firmware_sim.ladder import AGE_DEGRADED
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
-from plant_server.physiology import Patient, Variability, load_patient
+from plant_server.physiology import Patient, Variability, load_patient, parameters
 from plant_server.pump import PumpSettings
 from plant_server.scenario import (
     BUILT_IN,
@@ -32,7 +31,7 @@ from plant_server.scenario import (
     load_scenario,
     rescue_announcement,
 )
-from plant_server.sensor import STATE_OK, Sensor, SensorSettings, load_sensor
+from plant_server.sensor import STATE_OK, STATUS_EVERY, Sensor, SensorSettings, load_sensor
 from plant_server.sensors.ideal import Ideal
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
 from pumpbench.closed_loop.loop import Floats, Plan
@@ -41,6 +40,8 @@ from pumpbench.controller_model import ControllerModel
 
 DAYS_MAX = 100
 """Beyond, numbers on the wire begin anew that the loop does not follow."""
+
+CIRCADIAN = [parameters.CIRCADIAN_AMPLITUDE, parameters.CIRCADIAN_PHASE]
 
 KEPT = 64
 """Patients and seeds of which the arrays are kept."""
@@ -111,11 +112,13 @@ def prepare(case: Case) -> Plan:
         raise CaseError(f"sensor: effects ({sensor.effects[0].kind}) need the bus; the compiled loop has none")
     mode = MODES[case.mode]
     tuning = case.tuning or tuning_for(case.mode, noisy=not isinstance(sensor.model, Ideal))
-    parameters, limits = _calibration(_Key(patient), tuning, case.controller)
+    law, limits = _calibration(_Key(patient), tuning, case.controller)
+    meals = tuple(meal for meal in scenario.meals if meal.step < steps)
+    if any(meal.step < 0 for meal in meals):
+        raise CaseError(f"scenario {scenario.name}: a meal starts before the run")
     policy = POLICY_OF_MODE[mode]
     rescue = scenario.rescue
     sugar = None if rescue is None else rescue_announcement(scenario, policy, Meal(0, RESCUE, rescue.carbs))
-    bodies, meals, meal_mg, meal_body = _body(_Key(patient), scenario.meals, case.seed, frozenset(case.variability))
     pump = PumpSettings(basal_milliunits_per_h=round(patient.basal_u_per_h * 1000))
     settings = (
         pump.basal_milliunits_per_h,
@@ -129,18 +132,25 @@ def prepare(case: Case) -> Plan:
         *((0, 0, 0, 0) if rescue is None else (rescue.samples, int(sugar is not None), *_told(sugar))),
     )
     levels = (0.0, 0.0, 0.0) if rescue is None else (rescue.below, rescue.carbs * 1000, rescue.lockout_minutes)
+    bodies, starts, amounts, rows = _body(_Key(patient), meals, case.seed, frozenset(case.variability))
+    gain, offset, sent, forced, noise, session = _sensor(sensor, steps, case.seed, patient.name)
     return Plan(
-        np.array(settings, np.int64),
-        np.array([*levels, *sensor.range], np.float64),
-        parameters,
-        np.array(patient.x0),
-        bodies,
-        _carbs(scenario.meals, steps),
-        meals,
-        meal_mg,
-        meal_body,
-        _announced(scenario, policy, case.seed, patient.name),
-        *_sensor(sensor, steps, case.seed, patient.name),
+        settings=np.array(settings, np.int64),
+        levels=np.array([*levels, *sensor.range], np.float64),
+        parameters=law,
+        x0=np.array(patient.x0),
+        bodies=bodies,
+        meals=starts,
+        meal_mg=amounts,
+        meal_body=rows,
+        carbs=_carbs(meals, steps),
+        told=_announced(scenario, policy, case.seed, patient.name),
+        gain=gain,
+        offset=offset,
+        sent=sent,
+        forced=forced,
+        noise=noise,
+        session=session,
     )
 
 
@@ -196,12 +206,6 @@ _built_in = functools.lru_cache(KEPT)(load_scenario)
 # ---- arrays
 
 
-def _frozen(*arrays: Any) -> Any:
-    for array in arrays:
-        array.flags.writeable = False
-    return arrays
-
-
 @functools.lru_cache(KEPT)
 def _calibration(key: _Key, tuning: Tuning, model: ControllerModel | None) -> tuple[Words, tuple[int, int, int, int]]:
     """The law's parameters, and of the rest of the device: stuck samples, stale age, both limits of a day.
@@ -228,14 +232,18 @@ def _body(
 ) -> tuple[Floats, Words, Floats, Words]:
     """The patient's parameters from meal to meal, and the meals in the order in which they start."""
     nominal = key.patient.params
-    variability = Variability(seed, key.patient.name, sources)
-    bodies = [variability.apply(nominal)]
+    first = Variability(seed, key.patient.name, sources).apply(nominal)
+    of_meals = Variability(
+        seed, key.patient.name, sources - {"circadian"}
+    )  # that is the same all along, and slow to draw
+    bodies, rows = [first], []
     meals = sorted(planned, key=lambda meal: meal.step)
-    rows = []
     for meal in meals:
         rows.append(-1 if meal.kind == RESCUE else len(bodies))
         if meal.kind != RESCUE:
-            bodies.append(variability.apply(nominal, variability.meal(len(bodies) - 1)))
+            body = of_meals.apply(nominal, of_meals.meal(len(bodies) - 1))
+            body[CIRCADIAN] = first[CIRCADIAN]
+            bodies.append(body)
     steps = np.array([meal.step for meal in meals], np.int64)
     amounts = np.array([meal.carbs_g * 1000 for meal in meals], np.float64)
     return np.array(bodies), steps, amounts, np.array(rows, np.int64)
@@ -271,20 +279,30 @@ def _announced(scenario: Scenario, policy: Policy, seed: int, patient: str) -> W
 def _sensor(
     settings: SensorSettings, steps: int, seed: int, patient: str
 ) -> tuple[Floats, Floats, Words, Words, Words, Words]:
-    """Gain, offset, sent, forced state, noise and session, see `Plan`; asked of the sensor itself, instant by instant.
+    """Gain, offset, sent, forced state, noise and session, see `Plan`: asked of the sensor itself.
 
-    Without effects nothing of this depends on glucose, so any will do.
+    Without effects nothing of this depends on glucose, so any will do. A sensor that is always ready and never runs out
+    is asked only when it says something new of itself: to hear the same again changes nothing in the device.
     """
     sensor = Sensor(settings, steps + 1, seed, patient)
-    sent, forced = np.zeros(steps, np.int64), np.full(steps, STATE_OK, np.int64)
+    sent, forced = np.ones(steps, np.int64), np.full(steps, STATE_OK, np.int64)
     noise, session = np.full(steps, -1, np.int64), np.zeros(steps, np.int64)
     within = sum(settings.range) / 2
-    for step in range(steps):
+    asked: Iterable[int] = range(steps)
+    if sensor.additive_only and settings.renew:
+        worn, noise_sd = sensor.wear.session, sensor.errors.noise_sd
+        told = np.union1d(np.arange(0, steps, STATUS_EVERY), 1 + np.flatnonzero(np.diff(worn[:steps])))
+        new = (np.diff(worn[told]) != 0) | (np.diff(noise_sd[told]) != 0)
+        asked = told[np.concatenate(([True], new))].tolist()
+    for step in asked:
         gain, offset = sensor.errors.gain[step], sensor.errors.offset[step]
         sample = sensor.sample(step, (within - offset) / gain)
-        if sample is not None:
-            sent[step], forced[step] = 1, sample.state
+        if sample is None:
+            sent[step] = 0
+        else:
+            forced[step] = sample.state
         status = sensor.status(step)
         if status is not None:
             noise[step], session[step] = min(round(status.noise * 2), 252), status.session
-    return sensor.errors.gain, sensor.errors.offset, sent, forced, noise, session
+    errors = np.ascontiguousarray(sensor.errors.gain), np.ascontiguousarray(sensor.errors.offset)
+    return *errors, sent, forced, noise, session

@@ -48,10 +48,10 @@ class Plan(NamedTuple):
     parameters: Words  # of the control core
     x0: Floats
     bodies: Floats  # parameters of the patient: before the first meal, then from each meal to the next
-    carbs: Floats  # mg eaten in every 30-s step, one row per sampling interval
     meals: Words  # step of each meal that starts, in order
     meal_mg: Floats
     meal_body: Words  # row of `bodies` from that meal on; -1 = as before
+    carbs: Floats  # mg eaten in every 30-s step, one row per sampling interval
     told: Words  # step, kind and raw carbohydrate of every planned announcement, one row each
     gain: Floats  # of the sensor, one entry per sampling instant
     offset: Floats  # mg/dL
