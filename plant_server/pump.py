@@ -138,7 +138,7 @@ class PumpSettings:
     max_rate_raw: int = 6000  # 30 U/h, the largest rate of commercial pumps
     max_pramlintide_rate_raw: int = 3000  # 300 ug/h: 10 ug/U at the largest insulin rate
     max_bolus_raw: int = 3000  # 30 U, the largest bolus of commercial pumps
-    max_pramlintide_bolus_raw: int = 1200  # 120 ug, the largest labelled dose
+    max_pramlintide_bolus_raw: int = 3000  # 300 ug, the largest dose the paper tunes with; labelled are 120
     insulin: ChamberSettings = INSULIN
     pramlintide: ChamberSettings = PRAMLINTIDE
     coformulation_ug_per_u: float | None = None  # one chamber with both drugs in it; None: two chambers

@@ -88,7 +88,7 @@ def test_before_the_first_bolus_there_is_none(drug: int) -> None:
     ("drug", "purposes", "limit", "total"),
     [
         (INS, (AckFor.INSULIN_BOLUS_PROGRAM, AckFor.INSULIN_BOLUS_COMMIT), 3000, ("InsulinTotal", 2000)),
-        (PRAM, (AckFor.PRAM_BOLUS_PROGRAM, AckFor.PRAM_BOLUS_COMMIT), 1200, ("PramTotal", 2000)),
+        (PRAM, (AckFor.PRAM_BOLUS_PROGRAM, AckFor.PRAM_BOLUS_COMMIT), 3000, ("PramTotal", 2000)),
     ],
 )
 def test_program_commit_delivery(drug: int, purposes: tuple[int, int], limit: int, total: tuple[str, int]) -> None:
@@ -166,8 +166,8 @@ def test_the_two_drugs_do_not_wait_for_each_other() -> None:
         ({"dose": 4000}, OVER_LIMIT),
         ({"dose": 3001}, OVER_LIMIT),
         ({"dose": 3000}, ACCEPTED),
-        ({"dose": 1201, "drug": PRAM}, OVER_LIMIT),
-        ({"dose": 1200, "drug": PRAM}, ACCEPTED),
+        ({"dose": 3001, "drug": PRAM}, OVER_LIMIT),
+        ({"dose": 3000, "drug": PRAM}, ACCEPTED),
         ({"op": 0}, MALFORMED),
         ({"op": 15}, MALFORMED),
         ({"drug": 0}, MALFORMED),
@@ -591,7 +591,7 @@ def test_any_frame_at_all_is_answered_and_keeps_to_the_limits(frames: list[tuple
     bench = Bench()
     for drug, op, number, dose, until in frames:
         ack = bench.ack(op, number, dose, drug=drug, until=until)
-        assert ack["AckResult"] != ACCEPTED or op == CANCEL or dose <= (3000 if drug == INS else 1200)
+        assert ack["AckResult"] != ACCEPTED or op == CANCEL or dose <= 3000
         bench.run()
 
 
