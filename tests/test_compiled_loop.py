@@ -22,6 +22,10 @@ from firmware_sim.control import layout
 from firmware_sim.firmware import Firmware
 from firmware_sim.ladder import State
 from plant_server.bolus import AckResult
+from plant_server.chamber import INSULIN as INSULIN_CHAMBER
+from plant_server.chamber import PRAMLINTIDE as PRAMLINTIDE_CHAMBER
+from plant_server.chamber import Chamber
+from plant_server.mechanism import FLUID
 from plant_server.physiology import Patient, load_patient
 from plant_server.pump import AckFor
 from plant_server.scenario import Announcing, Meal, Rescue, Scenario, load_scenario
@@ -200,11 +204,29 @@ def test_a_sensor_that_repeats_itself_brings_the_device_down_the_ladder() -> Non
         SensorSettings(battery_days=0.5, renew=False),
         SensorSettings(lifetime_days=0.5, renew=False),
         SensorSettings.model_validate({"model": {"name": "coloured", "sd": 16}}),
+        SensorSettings(range=(115.0, 125.0), lifetime_days=0.02),
         *(load_sensor(name) for name in ("breton", "facchinetti", "dexcom-g6")),
     ],
 )
 def test_other_sensors(sensor: SensorSettings) -> None:
     the_same(Case("adult#005", mode="s3", days=0.7, sensor=sensor, seed=5))
+
+
+def test_sugar_that_is_told_waits_for_its_turn_and_so_does_a_meal_behind_it() -> None:
+    patient = load_patient("adult#001", basal_glucose=95.0)
+    rescue = Rescue(below=100.0, samples=1, carbs=1.0, lockout_minutes=0, announced=True)
+    meals = tuple(Meal(step, "Snack", 5.0) for step in (2, 3, 4))
+    result, _ = the_same(
+        Case(patient, mode="ma", scenario=Scenario("nibbles", 1, meals, rescue=rescue), variability=())
+    )
+    assert result.glucose[:7].max() < rescue.below  # sugar in every step
+    assert np.flatnonzero(result.bolus).tolist() == [2, 4, 6]
+
+
+def test_an_estimate_that_no_meal_can_have_is_refused() -> None:
+    scenario = feast(1, 120.0, told_percent=30.0)
+    result, _ = the_same(Case("adult#002", mode="ma", scenario=scenario))
+    assert not result.bolus.any()
 
 
 def test_rates_that_the_pump_refuses() -> None:
@@ -221,19 +243,31 @@ def test_reservoirs_that_run_empty() -> None:
     tuning = Tuning(pram_bolus=120.0)
     scenario = feast(4, 500.0, told_percent=-70.0)
     result, acks = the_same(
-        Case("adult#008", mode="s3", scenario=scenario, days=3.2, controller=controller, tuning=tuning)
+        Case("adult#008", mode="s3", scenario=scenario, days=3.4, controller=controller, tuning=tuning)
     )
     assert (AckFor.INSULIN_BOLUS_PROGRAM, AckResult.OVER_LIMIT) in acks
     assert (AckFor.CANCEL, AckResult.ACCEPTED) in acks
     assert not result.strokes[3 * DAY - 6 : 3 * DAY].any()
     assert result.strokes[3 * DAY :].any()
+    assert (
+        result.limiters[3 * DAY + 7 * 12] & layout.LIMITER_MAX_BOLUS
+    )  # as little as there was to be had the last time
 
 
 def test_pramlintide_that_runs_out() -> None:
-    tuning = Tuning(pram_ratio=40.0, pram_bolus=150.0, pram_tdd=1600.0, assumed_carbs=150.0)
-    result, acks = the_same(Case("adult#009", mode="s4", scenario=feast(4, 200.0), days=3.2, tuning=tuning))
+    tuning = Tuning(pram_ratio=40.0, pram_bolus=400.0, pram_tdd=1600.0, assumed_carbs=150.0)
+    result, acks = the_same(Case("adult#009", mode="s4", scenario=feast(6, 200.0), days=5.9, tuning=tuning))
     assert (AckFor.PRAM_BOLUS_PROGRAM, AckResult.OVER_LIMIT) in acks
     assert (result.pram_rate > 3000).any()
+    for day in (3, 6):
+        assert not result.pram_strokes[day * DAY - 60 : day * DAY - 30].any()  # empty before it is changed
+
+
+def test_what_a_new_reservoir_holds() -> None:
+    for settings, primed in ((INSULIN_CHAMBER, loop.INSULIN_PRIMED), (PRAMLINTIDE_CHAMBER, loop.PRAM_PRIMED)):
+        chamber = Chamber(settings)
+        chamber.change()
+        assert chamber.words[FLUID] == primed
 
 
 def test_a_patient_of_ones_own_and_other_physiology() -> None:
@@ -298,6 +332,12 @@ def test_machine_code_expires_with_any_of_its_sources(tmp_path: Path) -> None:
     assert [misses(), misses()] == [1, 0]
     other.write_text("A = 2\n")
     assert [misses(), misses()] == [1, 0]
+
+
+def test_code_that_cannot_be_kept_is_compiled_each_time() -> None:
+    scope: dict[str, object] = {}
+    exec("def double(x):\n    return 2 * x\n", scope)  # of no file: there is no place beside it
+    assert compiled.kept_on_disk([])(scope["double"])(4) == 8
 
 
 # ---- what is refused

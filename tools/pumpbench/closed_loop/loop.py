@@ -146,7 +146,7 @@ def give_boluses(
         else:
             pram_asked[device.LIMIT] = max(limit, pram_asked[device.LIMIT])
             if refused:  # a meal is refused as a whole: the pramlintide is cancelled
-                pump.abort(pram_given, pram_motor)
+                pump.cancel(pram_given, pram_motor)
                 pram_dose = 0
             else:
                 device.start(pram_asked, pram_dose)

@@ -6,14 +6,14 @@ method it repeats.
 
 from plant_server import mechanism
 from plant_server.bolus import STROKE_RAW, Phase
-from plant_server.mechanism import BOLUS, BOLUS_DELIVERED, BOLUS_HELD, FLUID, HELD, PENDING
+from plant_server.mechanism import BOLUS_DELIVERED, FLUID, HELD, PENDING
 from plant_server.pump import MILLIUNITS_PER_LSB
 from pumpbench.compiled import Words, helper
 
 begin_bolus = helper(mechanism.begin_bolus)
 end_bolus = helper(mechanism.end_bolus)
 
-IDLE, PROGRAMMED, DELIVERING = int(Phase.IDLE), int(Phase.PROGRAMMED), int(Phase.DELIVERING)
+PROGRAMMED, DELIVERING = int(Phase.PROGRAMMED), int(Phase.DELIVERING)
 DONE, ABORTED = int(Phase.DONE), int(Phase.ABORTED)
 
 RATE, PRAM_RATE, COMMANDED, EXPIRES = range(4)
@@ -91,22 +91,17 @@ def commit(bolus: Words, motor: Words, dose: int) -> None:
 
 
 @helper
-def abort(bolus: Words, motor: Words) -> None:
-    """`DrugBolus.abort`."""
+def cancel(bolus: Words, motor: Words) -> None:
+    """`DrugBolus.judge` of a Cancel in the instant of the Program."""
     end_bolus(motor)
-    if bolus[PHASE] in (PROGRAMMED, DELIVERING):
-        bolus[PHASE] = ABORTED
+    bolus[PHASE] = ABORTED
 
 
 @helper
 def follow(bolus: Words, motor: Words) -> None:
-    """`DrugBolus.follow`."""
-    if bolus[PHASE] != DELIVERING:
-        return
-    if motor[BOLUS_DELIVERED] == bolus[STROKES]:
+    """`DrugBolus.follow`: without air and occlusion a bolus always comes to its end, for the reservoir holds it."""
+    if bolus[PHASE] == DELIVERING and motor[BOLUS_DELIVERED] == bolus[STROKES]:
         bolus[PHASE] = DONE
-    elif motor[FLUID] == 0 or motor[BOLUS] + motor[BOLUS_HELD] == 0:
-        abort(bolus, motor)
 
 
 @helper
