@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pumpbench import compiled, rig
+from pumpbench.benchmark.closed_loop import closed_loop as benchmark
 from pumpbench.calibration import MODES, SAFE, Tuning, calibrate, tuning_for
 from pumpbench.closed_loop import Case, CaseError, LoopError, Result, loop, simulate
 from pumpbench.controller_model import ControllerModel, shipped_models
@@ -338,6 +339,13 @@ def test_code_that_cannot_be_kept_is_compiled_each_time() -> None:
     scope: dict[str, object] = {}
     exec("def double(x):\n    return 2 * x\n", scope)  # of no file: there is no place beside it
     assert compiled.kept_on_disk([])(scope["double"])(4) == 8
+
+
+def test_its_speed_is_a_figure_of_the_benchmark() -> None:
+    one, two = benchmark("compiled", days=1, runs=1)
+    assert (one["name"], two["name"]) == ("closed-loop/compiled", "closed-loop/compiled/2")
+    assert two["ceiling"] == pytest.approx(2 * one["value"], rel=1e-3)
+    assert one["ratio"] == pytest.approx(one["value"] / one["ceiling"], abs=1e-3)
 
 
 # ---- what is refused
