@@ -1,7 +1,9 @@
 """The command line. Commands import what they need when they run, so that --help is quick."""
 
+import contextlib
 import signal
 import sys
+from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -227,6 +229,110 @@ def identify_controller(
     console.print(table)
 
 
+WORKERS = "Processes on this machine (default: one per CPU)."
+CLUSTER = "A dask scheduler to hand the runs to instead, e.g. tcp://127.0.0.1:8786."
+VIA = "compiled, or a bus (inproc, hub, socketcan:vcan0): the same runs through the nodes themselves."
+
+
+@app.command()
+def campaign(
+    out: Annotated[Path, typer.Option(help="Folder of the results; what is there already is not run again.")],
+    patient: Annotated[str, typer.Option(help=PATIENTS)] = "all",
+    modes: Annotated[str, typer.Option(help="Comma list of nma, sma, ma, s1, s2, s3, s4; or all.")] = "all",
+    seeds: Annotated[str, typer.Option(help="Comma list of seeds and ranges, e.g. 1-10,42.")] = "1",
+    days: Annotated[int, typer.Option(help="Simulated days of every run.", min=1)] = 14,
+    scenario: Annotated[str, typer.Option(help=SCENARIOS + " Comma list.")] = "validation-14d",
+    parameter: Annotated[
+        list[str] | None, typer.Option("--set", help="NAME=V1,V2: values of a tuning parameter; may be repeated.")
+    ] = None,
+    sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
+    pramlintide: Annotated[str, typer.Option(help=PRAMLINTIDE)] = "P2",
+    variability: Annotated[str, typer.Option(help=VARIABILITY)] = "all",
+    physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,
+    controller: Annotated[Path | None, typer.Option(help="Controller models, by identify-controller.")] = None,
+    workers: Annotated[int | None, typer.Option(help=WORKERS, min=1)] = None,
+    cluster: Annotated[str | None, typer.Option(help=CLUSTER)] = None,
+    via: Annotated[str, typer.Option(help=VIA)] = "compiled",
+) -> None:
+    """Many runs: patients x modes x scenarios x seeds x parameters. Writes OUT/results.parquet, one row per run."""
+    from plant_server.physiology import load_patient  # noqa: PLC0415
+    from pumpbench import campaign as campaigns  # noqa: PLC0415
+    from pumpbench.rig import controller_model, variability_sources  # noqa: PLC0415
+
+    chosen = [mode.value for mode in Strategy] if modes == "all" else [mode.strip() for mode in modes.split(",")]
+    varying, tunings = variability_sources(variability), campaigns.parameter_grid(parameter or [])
+    jobs = []
+    for name in _patients(patient):
+        own = load_patient(name, physiology=physiology, pramlintide=pramlintide)
+        for each in scenario.split(","):
+            jobs += campaigns.grid(
+                [name],
+                chosen,
+                campaigns.seed_list(seeds),
+                days,
+                tunings=tunings,
+                scenario=each.strip(),
+                sensor=sensor,
+                pramlintide=pramlintide,
+                variability=varying,
+                physiology=physiology,
+                model=controller_model(name, own, controller),
+            )
+    with _progress() as progress:
+        results = campaigns.execute(
+            jobs, out / "results", workers=workers, cluster=cluster, via=via, progress=progress("runs")
+        )
+    path = results.write(jobs, out / "results.parquet")
+    console.print(f"{len(jobs)} runs: {path}", soft_wrap=True)
+
+
+@app.command()
+def study(
+    out: Annotated[Path, typer.Option(help="Folder of the report; an interrupted study goes on there.")],
+    days: Annotated[int, typer.Option(help="Simulated days of every run; the paper has 14.", min=1, max=14)] = 14,
+    patient: Annotated[str, typer.Option(help=PATIENTS)] = "all",
+    seeds: Annotated[str, typer.Option(help="Seeds of the validation.")] = "1001-1010",
+    controller: Annotated[Path | None, typer.Option(help="Controller models, by identify-controller.")] = None,
+    workers: Annotated[int | None, typer.Option(help=WORKERS, min=1)] = None,
+    cluster: Annotated[str | None, typer.Option(help=CLUSTER)] = None,
+    via: Annotated[str, typer.Option(help=VIA)] = "compiled",
+    quick: Annotated[bool, typer.Option(help="Without the second pramlintide set and the sensitivities.")] = False,
+) -> None:
+    """The paper's study: tuning, Tables 2 and 3, figures, report.html, and how far from the paper it all is."""
+    from plant_server.physiology import load_patient  # noqa: PLC0415
+    from pumpbench import campaign as campaigns  # noqa: PLC0415
+    from pumpbench.rig import controller_model  # noqa: PLC0415
+
+    try:
+        from pumpbench.study import plan, run  # noqa: PLC0415
+    except ImportError as error:
+        raise Failed(EXIT_USAGE, f"{error.name} is missing: pip install 'pumpbench[study]'") from None
+    names = tuple(_patients(patient))
+    models = {name: controller_model(name, load_patient(name), controller) for name in names}
+    with _progress() as progress:
+        settings = run.Settings(
+            out, plan.Cohort(names, models), days, tuple(campaigns.seed_list(seeds)), workers, cluster, via, quick
+        )
+        say = progress("study")
+        report = run.Study(settings, lambda text: errors.print(text, markup=False), say).run()
+    console.print(f"report: {report}", soft_wrap=True)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[str], Callable[[int, int], None]]]:
+    """A bar with an estimate of the end, for a count of things done."""
+    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn  # noqa: PLC0415
+
+    columns = (*Progress.get_default_columns()[:3], MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+
+        def begin(what: str) -> Callable[[int, int], None]:
+            task = bar.add_task(what, total=None)
+            return lambda done, of: bar.update(task, completed=done, total=of)
+
+        yield begin
+
+
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
 def firmware(context: typer.Context) -> None:
     """Start the reference firmware on a bus, for people who bring the plant."""
@@ -392,6 +498,8 @@ def _status(error: Exception) -> int | None:
     from plant_server.serve import MemberSilent  # noqa: PLC0415
     from plant_server.server import PlantError  # noqa: PLC0415
     from pumpbench.calibration import CalibrationError  # noqa: PLC0415
+    from pumpbench.campaign import CampaignError, ClusterError  # noqa: PLC0415
+    from pumpbench.closed_loop import CaseError, LoopError  # noqa: PLC0415
     from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
@@ -400,10 +508,12 @@ def _status(error: Exception) -> int | None:
         return error.status
     if isinstance(error, Interrupted):
         return EXIT_INTERRUPTED
-    wrong = BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
+    wrong = (
+        CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
+    )
     if isinstance(error, wrong | CalibrationError | ControllerModelError | RigError | RunFolderError):
         return EXIT_USAGE
-    if isinstance(error, NodeDied | MemberSilent | PlantError | can.CanError | OSError):
+    if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD
     return None
 

@@ -41,7 +41,7 @@ from plant_server.sensors.ideal import Ideal
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
 from pumpbench import __version__
-from pumpbench.calibration import MODES, calibrate, tuning_for
+from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
 from pumpbench.capture import Capture
 from pumpbench.controller_model import ControllerModel, ControllerModelError, read_models, shipped_models
 from pumpbench.faults import Faults, write_wire
@@ -83,6 +83,8 @@ class Request:
     pramlintide: str = "P2"
     variability: tuple[str, ...] = tuple(SOURCES)
     controller: Path | None = None  # models of patients of one's own; None: those of the package
+    model: ControllerModel | None = None  # one that is at hand, instead
+    tuning: Tuning | None = None  # None: that of the strategy
     overwrite: bool = False
     connect_timeout: float = 20.0
     step_timeout: float = 10.0
@@ -140,9 +142,10 @@ def prepare(request: Request) -> Prepared:
             f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
         )
     faults = load_fault_file(request.faults) if request.faults else Faults()
-    model = controller_model(request.patient, patient, request.controller)
+    model = request.model or controller_model(request.patient, patient, request.controller)
     sensor = load_sensor(request.sensor)
-    calibration = calibrate(patient, tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal)), model)
+    tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
+    calibration = calibrate(patient, tuning, model)
     mode = MODES[request.strategy]
     sensor = sensor.model_copy(update={"effects": (*sensor.effects, *faults.sensor)})
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, faults.pump)

@@ -460,6 +460,9 @@ TBR_MARGIN: Final = 0.5
 """Percent points of mean time below 70 mg/dL within which two tunings count as similar; choice, an eighth of the
 consensus limit of 4 %."""
 
+THRESHOLD_MARGIN: Final = 0.1
+"""The same for strategy 1's thresholds, which say when a dose is given, not how much: nearly only the time counts."""
+
 
 def sweeps_thresholds(tuning: pd.DataFrame) -> pd.Series:
     """Which tuning runs belong to the search for z1, z2, z3 of strategy 1 (those with a z1)."""
@@ -493,35 +496,40 @@ class Selection:
     """Columns label, tir_70_180, tbr_70, tar_180, pramlintide_ug_per_day (means over patients), similar."""
 
 
-def select(tuning: pd.DataFrame, *, tir_margin: float = TIR_MARGIN, tbr_margin: float = TBR_MARGIN) -> Selection:
+def select(
+    tuning: pd.DataFrame,
+    *,
+    tir_margin: float = TIR_MARGIN,
+    tbr_margin: float = TBR_MARGIN,
+    least: str = "pramlintide_ug_per_day",
+) -> Selection:
     """The paper's rule on the tuning runs of one strategy, candidates told apart by `label`.
 
     The paper takes the longest time in range with the lowest time in hypoglycaemia and, of tunings that behave
     similarly in both, the one with the lowest daily pramlintide. Here, with means over patients (seeds averaged first):
     keep what is within tir_margin of the longest time in range, of that keep what is within tbr_margin of the lowest
     time below 70, of that take the lowest daily pramlintide; a tie goes to the longer time in range, then to the label
-    in order.
+    in order. Where no pramlintide is given, `least` names another column of what is to be as small as possible.
 
     Raises:
         ValueError: no runs, more than one strategy, a missing column, or a candidate that lacks a patient.
     """
-    metrics = ["tir_70_180", "tbr_70", "tar_180", "pramlintide_ug_per_day"]
+    metrics = list(dict.fromkeys(["tir_70_180", "tbr_70", "tar_180", "pramlintide_ug_per_day", least]))
     check_columns(tuning, ["label", "mode", "patient", "seed", *metrics])
     modes = sorted(set(tuning["mode"]))
     if len(modes) != 1:
         raise ValueError(f"tuning: runs of one strategy expected, got {' '.join(modes) or 'none'}")
     by_label = tuning.assign(mode=tuning["label"])
     means = pd.DataFrame({metric: _whole(per_patient(by_label, metric)).mean() for metric in metrics})
-    table = means.rename_axis("label").reset_index().sort_values(["pramlintide_ug_per_day", "label"])
+    table = means.rename_axis("label").reset_index().sort_values([least, "label"])
     table["similar"] = table["tir_70_180"] >= table["tir_70_180"].max() - tir_margin
     table["similar"] &= table["tbr_70"] <= table.loc[table["similar"], "tbr_70"].min() + tbr_margin
-    order = table[table["similar"]].sort_values(
-        ["pramlintide_ug_per_day", "tir_70_180", "label"], ascending=[True, False, True]
-    )
+    order = table[table["similar"]].sort_values([least, "tir_70_180", "label"], ascending=[True, False, True])
     chosen, best = order.iloc[0], table.loc[table["tir_70_180"].idxmax()]
+    what = "pramlintide" if least == "pramlintide_ug_per_day" else least
     why = (
         f"{chosen['label']}: {chosen['tir_70_180']:.2f} % in range and {chosen['tbr_70']:.2f} % below 70 with "
-        f"{chosen['pramlintide_ug_per_day']:.1f} µg/day, the least pramlintide of {len(order)} of {len(table)} tunings "
+        f"{chosen['pramlintide_ug_per_day']:.1f} µg/day, the least {what} of {len(order)} of {len(table)} tunings "
         f"within {tir_margin:.1f} points of the longest time in range ({best['label']}: {best['tir_70_180']:.2f} %) "
         f"and {tbr_margin:.1f} points of the lowest time below 70 among them"
     )

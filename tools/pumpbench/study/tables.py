@@ -120,5 +120,8 @@ def selections(runs: pd.DataFrame) -> Mapping[str, statistics.Selection]:
     """What the paper's rule chooses per strategy and, as "s1 thresholds", for z1, z2, z3 of the tuning runs."""
     tuning = runs[runs["part"] == "tuning"]
     parts = {strategy: statistics.dose_runs(tuning, strategy) for strategy in paper.STRATEGIES}
-    parts["s1 thresholds"] = tuning[statistics.sweeps_thresholds(tuning)]
-    return {name: statistics.select(part) for name, part in parts.items() if len(part)}
+    chosen = {name: statistics.select(part) for name, part in parts.items() if len(part)}
+    thresholds = tuning[statistics.sweeps_thresholds(tuning)]
+    if len(thresholds):
+        chosen["s1 thresholds"] = statistics.select(thresholds, tir_margin=statistics.THRESHOLD_MARGIN)
+    return chosen
