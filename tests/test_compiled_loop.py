@@ -9,6 +9,7 @@ import sys
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,11 +28,13 @@ from plant_server.chamber import INSULIN as INSULIN_CHAMBER
 from plant_server.chamber import PRAMLINTIDE as PRAMLINTIDE_CHAMBER
 from plant_server.chamber import Chamber
 from plant_server.mechanism import FLUID
-from plant_server.physiology import Patient, load_patient
+from plant_server.physiology import SOURCES, Patient, load_patient
 from plant_server.pump import AckFor
 from plant_server.scenario import Announcing, Meal, Rescue, Scenario, load_scenario
+from plant_server.scenarios.announcing import Late
 from plant_server.scenarios.misestimation import Gaussian
 from plant_server.sensor import SensorSettings, load_sensor
+from plant_server.sensors import MODELS
 from plant_server.sensors.ideal import Ideal
 from plant_server.server import PlantServer, Run
 
@@ -277,6 +280,76 @@ def test_a_patient_of_ones_own_and_other_physiology() -> None:
     result, _ = the_same(Case(patient, mode="s4", scenario="camerlingo", days=1, controller=controller, seed=0))
     by_name, _ = the_same(Case("adult#010", mode="s4", scenario="camerlingo", physiology="S2013", pramlintide="P4"))
     assert (result.glucose != by_name.glucose).any()
+
+
+def anything(number: int) -> Case:
+    """A case drawn from everything that can be asked for, far beyond what anybody would."""
+    generator = np.random.default_rng(number)
+
+    def pick(*choices: Any) -> Any:
+        return choices[int(generator.integers(len(choices)))]
+
+    days = pick(0.5, 1, 2, 4)
+    kinds = ("Breakfast", "Lunch", "Dinner", "Snack")
+    meals = [
+        Meal(int(generator.integers(0, days * DAY)), pick(*kinds), float(np.exp(generator.uniform(1.1, 5.7))))
+        for _ in range(int(generator.integers(0, 14 * days)))
+    ]
+    habits = Announcing(
+        estimate=pick("exact", "kawamura", "gaussian"),
+        missed=pick(0.0, 0.3),
+        late=pick(None, Late(probability=0.5)),
+        ahead_minutes=pick(0, 15, 60),
+    )
+    rescue = pick(None, Rescue(), Rescue(below=100, samples=1, carbs=40, lockout_minutes=5, announced=True))
+    sensor = {
+        "model": pick(*MODELS, {"name": "coloured", "sd": pick(2, 12, 16, 40)}),
+        "sample_minutes": pick(5, 5, 5, 5, 10, 15),
+        "range": pick((40, 400), (40, 400), (90, 200), (0, 800)),
+        "warmup_minutes": pick(0, 0, 60, 120),
+        "lifetime_days": pick(None, None, 0.4, 1.0),
+        "renew": pick(True, True, False),
+        "worn_minutes": pick(0, 300),
+        "battery_days": pick(90, 90, 0.7),
+    }
+    tuning = Tuning(
+        theta=generator.uniform(5, 30),
+        gain=generator.uniform(0.2, 3),
+        bolus_deduction=generator.uniform(0, 1),
+        meal_factor=generator.uniform(0.2, 1),
+        assumed_carbs=generator.uniform(5, 150),
+        pram_ratio=pick(0, 6, 10, 25, 40),
+        pram_bolus=pick(0, 0.3, 15, 30, 130, 400),
+        max_basal=pick(1, 5, 30, 40),
+        max_bolus=pick(0.03, 3, 30, 40),
+        max_iob=pick(2, 8, 40),
+        peak_ratio=generator.uniform(0.5, 3),
+        peak_slope=generator.uniform(0.1, 1),
+        basal_factor=pick(0.5, 4, 25.5),
+        low_suspend=pick(0, 70, 110),
+        bolus_lockout=pick(0, 3, 12),
+        max_rise=pick(0.2, 2, 60),
+        pram_tdd=pick(20, 200, 1000, 1600),
+        stuck_samples=pick(0, 2, 3, 10),
+    )
+    loose = replace(tuning, max_basal=40.0, max_rise=60.0, basal_factor=25.5, max_iob=40.0, low_suspend=0.0, gain=3.0)
+    return Case(
+        pick(*ADULTS),
+        mode=pick(*MODES),
+        scenario=Scenario("anything", 4, tuple(sorted(meals)), habits, rescue),
+        seed=number,
+        days=days,
+        sensor=SensorSettings.model_validate(sensor),
+        variability=pick((), tuple(SOURCES)),
+        tuning=pick(tuning, loose, SAFE),
+        physiology=pick(None, "S2013"),
+        pramlintide=pick(None, "P4"),
+    )
+
+
+@pytest.mark.parametrize("number", range(300 if NIGHTLY else 10))
+def test_anything_that_can_be_asked_for(number: int) -> None:
+    the_same(anything(number))
 
 
 # ---- the outcome
