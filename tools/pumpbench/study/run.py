@@ -235,8 +235,8 @@ def variations(law: Law) -> dict[str, Variation]:
 
 _DEEP: Final = (
     "meals are absorbed faster here under continuous pramlintide than the paper's figures suggest: there glucose stays "
-    "flat near 140 mg/dL, here it still rises above. The public data on gastric emptying do not say how deep the effect "
-    "goes (docs/pramlintide.md); with the paper's ratio of 10 instead of the one chosen here both come nearer "
+    "flat near 140 mg/dL, here it still rises above. The public data on gastric emptying do not say how deep the "
+    "effect goes (docs/pramlintide.md); with the paper's ratio of 10 instead of the one chosen here both come nearer "
     "(see Sensitivity)"
 )
 _LOW: Final = (
