@@ -368,3 +368,19 @@ def test_pramlintide_that_is_refused_itself_does_not_end_the_insulin_of_its_meal
     talk.ack(PRAMLINTIDE, Op.PROGRAM, echo=299)
     talk.boluses.listen()
     assert talk.speak() == [(INSULIN, Op.COMMIT), (PRAMLINTIDE, Op.CANCEL)]
+
+
+def test_a_bolus_that_goes_on_does_not_hold_up_the_other_drug() -> None:
+    talk = committed()
+    talk.tell(INSULIN, Phase.DELIVERING, number=0, delivered=100)
+    talk.next()
+    talk.boluses.start(PRAMLINTIDE, 300, talk.step)
+    assert talk.speak() == [(PRAMLINTIDE, Op.PROGRAM)]
+    talk.ack(PRAMLINTIDE, Op.PROGRAM)
+    talk.boluses.listen()
+    assert talk.speak() == [(PRAMLINTIDE, Op.COMMIT)]
+
+
+def test_what_is_stored_of_an_open_bolus() -> None:
+    talk = committed()
+    assert talk.boluses.save() == [1, 1, 0, 250, 10 + EXPIRES_AFTER, 1, 250, 0, 0, 0, 0, 0, 0]

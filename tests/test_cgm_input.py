@@ -456,3 +456,12 @@ def test_a_hundred_thousand_well_protected_random_frames_dose_nothing_above_the_
             check_limits(turn, bench)
             states.add(turn.state)
     assert len(states) >= 2
+
+
+def test_every_frame_that_could_not_be_read_is_no_lost_one() -> None:
+    cgm = Cgm()
+    sample = {"CgmState": 1, "GlucoseConc": 1200, "CgmSampleSeq": 5, "CgmSampleStep": 5}
+    cgm.judge([sample], 5)
+    cgm.skip(), cgm.skip()
+    cgm.judge([], 6)
+    assert cgm.judge([{**sample, "CgmSampleSeq": 8, "CgmSampleStep": 7}], 7).missing == 0

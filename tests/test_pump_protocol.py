@@ -78,7 +78,7 @@ def test_the_pumps_limits_cut_and_keep_the_ratio(
 
 def test_without_a_rate_no_limit_cuts_and_no_field_is_filled() -> None:
     pump = Pump()
-    pump.rate_limit = 0
+    pump.rate_limit = pump.pram_rate_limit = 0
     for op in (Op.SUSPEND, Op.RESUME_SCHEDULE):
         wire = Wire()
         assert not pump.command(wire, op, 7)  # type: ignore[arg-type]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from firmware_sim.control import core, layout, limits, prandial
+from firmware_sim.control import core, layout, limits, observer, prandial
 from firmware_sim.control.layout import MEAL_CARBS, MEAL_NONE, MEAL_SIMPLE, MEAL_SNACK
 from firmware_sim.control.strategies import s1, s3, s4
 
@@ -65,6 +65,35 @@ def test_waiting_ends(word: int) -> None:
         core.wait(words)
         seen.append(words[word])
     assert seen == [2, 1, 0, 0, 0]
+
+
+def test_off_asks_for_nothing() -> None:
+    told = outputs()
+    core.control_step(state(), parameters(MEAL_GAIN=1), inputs(IN_MODE=OFF, IN_DELIVERED=-1), told)
+    assert (told[layout.OUT_DEMAND], told[layout.OUT_RATE]) == (0, 0)
+
+
+def test_what_was_delivered_and_is_not_known_is_taken_as_the_schedule() -> None:
+    flashed = parameters(BASAL=1200)
+    assert observer.above_schedule(flashed, inputs(IN_DELIVERED=-1), 14) == 0
+    assert observer.above_schedule(flashed, inputs(IN_DELIVERED=101), 14) == 1 << 14
+
+
+def test_before_the_first_sample_there_is_no_meal_and_zero_is_a_sample() -> None:
+    words = state(GLUCOSE=1500)
+    assert observer.meal_insulin(words, parameters(MEAL_GAIN=1), inputs(IN_GLUCOSE=-1, IN_DELIVERED=-1)) == 0
+    assert (words[layout.PRIMED], words[layout.GLUCOSE]) == (0, 1500)
+    observer.meal_insulin(words, parameters(MEAL_GAIN=1), inputs(IN_GLUCOSE=0, IN_DELIVERED=-1))
+    assert (words[layout.PRIMED], words[layout.GLUCOSE]) == (1, 0)
+
+
+def test_an_observer_beyond_its_words_is_clamped_and_counted() -> None:
+    most = (1 << 31) - 1
+    words = state(SATURATIONS=5, LAG_3=most)
+    flashed = parameters(INSULIN_GAIN=67108863, INSULIN_A33=(1 << 30) - 1, MEAL_GAIN=1)
+    observer.meal_insulin(words, flashed, inputs(IN_GLUCOSE=8000, IN_DELIVERED=-1))
+    assert words[layout.SATURATIONS] == 5 + 2  # the effect of insulin, and with glucose on top once more
+    assert words[layout.V_1] == most
 
 
 # ---- strategy 1
