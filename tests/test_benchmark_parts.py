@@ -1,0 +1,23 @@
+"""The benchmark's parts run and are what they are called, and the page is made of the figures."""
+
+from pumpbench.benchmark import page, parts
+from pumpbench.benchmark.round_trips import Figure
+
+
+def test_every_part_gives_a_figure_with_its_ceiling() -> None:
+    found = parts.figures(quick=True)
+    assert [each["name"] for each in found] == [
+        "codec/pack", "codec/unpack", "codec/protected", "recorder/listening", "recorder/writing",
+        "start/pumpbench --version", "start/firmware --help", "start/first compiled day", "memory/campaign",
+        "scaling/ten patients",
+    ]  # fmt: skip
+    for each in found:
+        assert set(each) == {"name", "value", "unit", "ceiling", "ratio", "runs"}
+        assert each["value"] > 0 and each["ceiling"] > 0 and each["ratio"] > 0, each["name"]
+
+
+def test_the_page_has_every_figure_and_the_machine() -> None:
+    figure = Figure(name="closed-loop/x", value=1234.5, unit="patient-days/s", ceiling=2.5, ratio=493.8, runs=3)
+    text = page.page([figure])
+    assert "| `closed-loop/x` | 1,234.5 | patient-days/s | 2.5 | 493.8 | 3 |" in text
+    assert page.machine() in text and "numba" in page.machine()
