@@ -104,7 +104,7 @@ def test_a_fault_file(tmp_path: Path) -> None:
         (
             "faults:\n  - {kind: drop, message: Xyz}\n",
             2,
-            r"the DBC has no message .*; it has SYNC_Step, .*HB_CGM \(found 'Xyz'\)",
+            r"the DBC has no message .*; it has SYNC_Step, .*UDS_Response \(found 'Xyz'\)",
         ),
         ("faults:\n  - {kind: drop, message: 5}\n", 2, r"the DBC has no message .*\(found 5\)"),
         ("faults:\n  - {kind: drop, message: [CGM_Reading]}\n", 2, r"the DBC has no message "),

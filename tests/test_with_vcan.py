@@ -24,6 +24,9 @@ ELSEWHERE = platform.system() != "Linux" or platform.machine() != "x86_64"
 # Under CI a vcan that cannot be had is a failure, whatever the reason.
 pytestmark = pytest.mark.skipif(ELSEWHERE and not os.environ.get("CI"), reason="vcan needs Linux on x86-64")
 
+# A suite that was started in the background inherits an ignored SIGINT, and so would the commands here.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 ODD = "two words, 'single' \"double\" $HOME `x` \\ and\na new line\t"
 
 
