@@ -68,9 +68,21 @@ def test_waiting_ends(word: int) -> None:
 
 
 def test_off_asks_for_nothing() -> None:
-    told = outputs()
-    core.control_step(state(), parameters(MEAL_GAIN=1), inputs(IN_MODE=OFF, IN_DELIVERED=-1), told)
-    assert (told[layout.OUT_DEMAND], told[layout.OUT_RATE]) == (0, 0)
+    told, words = outputs(), state(DEMAND=5)
+    core.control_step(words, parameters(MEAL_GAIN=1), inputs(IN_MODE=OFF, IN_DELIVERED=-1), told)
+    assert (told[layout.OUT_DEMAND], told[layout.OUT_RATE], words[layout.DEMAND]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("carbs", "stop", "dose", "refused"),
+    [(0, 0, 0, 0), (1, 0, 400, 0), (1, 1, 0, 1)],  # half a gram at 0.1 g/U and nu = 0.8
+)
+def test_the_least_of_a_meal_is_dosed_for_or_refused(carbs: int, stop: int, dose: int, refused: int) -> None:
+    told = outputs(OUT_REFUSED=9)
+    flashed = parameters(MEAL_GAIN=1, CARB_RATIO=10, MEAL_FACTOR=800)
+    meal = inputs(IN_MODE=MA, IN_DELIVERED=-1, IN_MEAL=MEAL_CARBS, IN_CARBS=carbs, IN_BOLUS_STOP=stop)
+    core.control_step(state(), flashed, meal, told)
+    assert (told[layout.OUT_BOLUS], told[layout.OUT_REFUSED]) == (dose, refused)
 
 
 def test_what_was_delivered_and_is_not_known_is_taken_as_the_schedule() -> None:
