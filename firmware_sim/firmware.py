@@ -606,19 +606,22 @@ class Firmware:
             **({} if used is None else {"LastCgmSeq": used}),
             **({} if self._meals.last is None else {"LastMealId": self._meals.last}),
         )
-        receiver = self._receiver
         self._turn.send(
             "CTRL_Diag",
             E2eErrorCount=min(self._e2e_errors(), 4095),
             LostFrameCount=min(self._lost_frames(), 4095),
-            SequenceErrorCount=min(self._sequence_errors + receiver.sequence_errors + self._refused_by_number(), 1023),
+            SequenceErrorCount=min(self._all_sequence_errors(), 1023),
             SaturationCount=min(self._state[layout.SATURATIONS], 1023),
-            NvmFallbackCount=0 if self._nvm is None else min(self._nvm.fallbacks, 255),
+            NvmFallbackCount=min(self._fallbacks(), 255),
         )
         self._send_heartbeat(NMT_OPERATIONAL if self._calibration.active else NMT_PRE_OPERATIONAL)
 
-    def _refused_by_number(self) -> int:
-        return self._pump.refused + self._meals.repeated
+    def _all_sequence_errors(self) -> int:
+        by_number = self._pump.refused + self._meals.repeated
+        return self._sequence_errors + self._receiver.sequence_errors + by_number
+
+    def _fallbacks(self) -> int:
+        return 0 if self._nvm is None else self._nvm.fallbacks
 
     def _e2e_errors(self) -> int:
         return self._receiver.crc_errors + self._receiver.malformed + self._impostors
@@ -738,9 +741,9 @@ class Firmware:
         counters = (
             self._e2e_errors(),
             self._lost_frames(),
-            self._sequence_errors + self._receiver.sequence_errors + self._refused_by_number(),
+            self._all_sequence_errors(),
             self._state[layout.SATURATIONS],
-            0 if self._nvm is None else self._nvm.fallbacks,
+            self._fallbacks(),
             self._scheduler.overruns,
             self._boots,
         )

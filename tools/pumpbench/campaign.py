@@ -280,6 +280,7 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._keys: dict[Path, set[str]] = {}  # of the files read so far, which never change
         folder.mkdir(parents=True, exist_ok=True)
 
     def add(self, rows: Sequence[dict[str, Any]]) -> None:
@@ -299,7 +300,11 @@ class Results:
         Raises:
             CampaignError: a file cannot be read.
         """
-        return {key for table in self._tables(["key"]) for key in table.column("key").to_pylist()}
+        found = set(self.folder.glob("part-*.parquet"))
+        self._keys = {path: keys for path, keys in self._keys.items() if path in found}
+        for path in sorted(found - self._keys.keys()):
+            self._keys[path] = set(self._read(path, ["key"]).column("key").to_pylist())
+        return set().union(*self._keys.values())
 
     def table(self, jobs: Sequence[Job], columns: Sequence[str] | None = None) -> pa.Table:
         """The rows of these jobs in their order, whatever the order in which they came.
@@ -308,8 +313,10 @@ class Results:
             CampaignError: a file cannot be read, or a result is missing.
         """
         names = list(columns) if columns else [name for name in SCHEMA.names if name not in SERIES]
-        read = list(dict.fromkeys(["key", *names]))
-        found = pa.concat_tables([SCHEMA.empty_table().select(read), *self._tables(read)])
+        read, wanted = list(dict.fromkeys(["key", *names])), {job.key for job in jobs}
+        self.keys()
+        parts = [self._read(path, read) for path, keys in self._keys.items() if keys & wanted]
+        found = pa.concat_tables([SCHEMA.empty_table().select(read), *parts])
         place = {key: number for number, key in enumerate(found.column("key").to_pylist())}
         missing = sum(job.key not in place for job in jobs)
         if missing:
@@ -323,16 +330,15 @@ class Results:
         partial.replace(path)
         return path
 
-    def _tables(self, columns: list[str]) -> Iterator[pa.Table]:
-        for path in sorted(self.folder.glob("part-*.parquet")):
-            try:
-                yield pq.read_table(path, columns=columns)
-            except (OSError, pa.ArrowException, KeyError) as error:
-                reason = str(error).splitlines()[0]
-                raise CampaignError(
-                    f"{path}: no results of this version can be read from it ({reason}); "
-                    "remove it, and its runs are made again"
-                ) from None
+    def _read(self, path: Path, columns: list[str]) -> pa.Table:
+        try:
+            return pq.read_table(path, columns=columns)
+        except (OSError, pa.ArrowException, KeyError) as error:
+            reason = str(error).splitlines()[0]
+            raise CampaignError(
+                f"{path}: no results of this version can be read from it ({reason}); "
+                "remove it, and its runs are made again"
+            ) from None
 
 
 # ---- running
@@ -344,7 +350,7 @@ Progress = Callable[[int, int], None]
 
 def execute(
     jobs: Sequence[Job],
-    folder: Path,
+    folder: Path | Results,
     *,
     workers: int | None = None,
     cluster: str | None = None,
@@ -355,7 +361,7 @@ def execute(
 
     Args:
         jobs: what to run; the same one twice is run once.
-        folder: of the results.
+        folder: of the results, or the results themselves where several campaigns share them.
         workers: processes on this machine; default: one per CPU. 1 runs in this process.
         cluster: address of a dask scheduler, e.g. tcp://127.0.0.1:8786, instead of this machine.
         via: as for `run_job`.
@@ -367,7 +373,7 @@ def execute(
     Raises:
         CampaignError, ClusterError: see there. What was done until then is kept.
     """
-    results = Results(folder)
+    results = folder if isinstance(folder, Results) else Results(folder)
     known = results.keys()
     wanted = {job.key: job for job in jobs}
     open_jobs = [job for key, job in wanted.items() if key not in known]

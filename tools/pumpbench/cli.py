@@ -156,20 +156,15 @@ def _run_folder(out: Path | None, patient: str, several: bool, label: str) -> Pa
 def _execute(prepared: list[Any]) -> list[Path]:
     import dataclasses  # noqa: PLC0415
 
-    from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # noqa: PLC0415
-
     from pumpbench import rig  # noqa: PLC0415
 
     folders = []
-    columns = (*Progress.get_default_columns()[:3], TimeElapsedColumn(), TextColumn("/"), TimeRemainingColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+    with _progress() as progress:
         for one in prepared:
-            task = bar.add_task(f"{one.request.patient} {one.request.strategy}", total=one.request.steps)
-            request = dataclasses.replace(
-                one.request, progress=lambda step, task=task: bar.update(task, completed=step)
-            )
+            show = progress(f"{one.request.patient} {one.request.strategy}")
+            steps = one.request.steps
+            request = dataclasses.replace(one.request, progress=lambda step, show=show, of=steps: show(step, of))
             folders.append(rig.execute(dataclasses.replace(one, request=request)))
-            bar.remove_task(task)
     return folders
 
 
@@ -320,13 +315,15 @@ def study(
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[str], Callable[[int, int], None]]]:
-    """A bar with an estimate of the end, for a count of things done."""
+    """A bar with an estimate of the end, for a count of things done; what begins next takes its place."""
     from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn  # noqa: PLC0415
 
     columns = (*Progress.get_default_columns()[:3], MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
 
         def begin(what: str) -> Callable[[int, int], None]:
+            for over in bar.task_ids:
+                bar.remove_task(over)
             task = bar.add_task(what, total=None)
             return lambda done, of: bar.update(task, completed=done, total=of)
 

@@ -9,8 +9,6 @@ to a patient.
 
 import csv
 import functools
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +21,7 @@ from scipy.optimize import least_squares
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from plant_server.physiology import Patient
+from pumpbench.files import write_file
 
 SAMPLE_MINUTES = 5.0
 DELAY_SAMPLES = 3
@@ -120,15 +119,7 @@ def write_models(path: Path, models: Sequence[ControllerModel]) -> None:
         ",".join(COLUMNS),
         *(",".join([model.patient, *(f"{value:.6g}" for value in model[1:])]) for model in models),
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=path.name, suffix=".partial", dir=path.parent)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write("\n".join(lines) + "\n")
-        Path(name).replace(path)
-    except OSError:
-        Path(name).unlink()
-        raise
+    write_file(path, ("\n".join(lines) + "\n").encode())
 
 
 # ---- identification

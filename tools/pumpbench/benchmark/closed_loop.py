@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 
@@ -28,13 +27,14 @@ from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from pumpbench import rig
 from pumpbench.benchmark import parts, simglucose_peer
-from pumpbench.benchmark.round_trips import CEILING_OF, Figure, measure, round_trips, vcan_available
+from pumpbench.benchmark.round_trips import CEILING_OF, Figure, figure, measure, round_trips, vcan_available
 from pumpbench.calibration import MODES
 from pumpbench.closed_loop import Case, simulate
 from pumpbench.trace import decode
 
 PATIENT = "adult#002"
 STRATEGY = "s2"
+UNIT = "patient-days/s"
 WITH_VCAN = Path(__file__).parents[3] / "tools" / "with_vcan"
 
 
@@ -63,19 +63,7 @@ def plant_alone(*, days: int = 100, runs: int = 5) -> list[Figure]:
     rate(SUBSTEPS)
     values = [rate(SUBSTEPS) for _ in range(runs)]
     ceilings = [rate(STEPS_PER_DAY * SUBSTEPS) for _ in range(runs)]
-    return [_figure("plant/alone", values, ceilings)]
-
-
-def _figure(name: str, values: list[float], ceilings: list[float]) -> Figure:
-    value, ceiling = median(values), median(ceilings)
-    return Figure(
-        name=name,
-        value=round(value, 2),
-        unit="patient-days/s",
-        ceiling=round(ceiling, 2),
-        ratio=round(value / ceiling, 3),
-        runs=len(values),
-    )
+    return [figure("plant/alone", UNIT, values, ceilings)]
 
 
 def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
@@ -108,9 +96,9 @@ def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
                 ceilings.append(single.rate / (to_device + back) / STEPS_PER_DAY)
                 exchanges.append(measure(CEILING_OF[kind], 2000, to_device, back, True).rate / STEPS_PER_DAY)
     if kind == "inproc":
-        return [_figure("closed-loop/inproc", values, [plant_alone(days=20, runs=3)[0]["value"]])]
+        return [figure("closed-loop/inproc", UNIT, values, [plant_alone(days=20, runs=3)[0]["value"]])]
     name = f"closed-loop/{kind}"
-    return [_figure(name, values, ceilings), _figure(f"{name}/exchange", values, exchanges)]
+    return [figure(name, UNIT, values, ceilings), figure(f"{name}/exchange", UNIT, values, exchanges)]
 
 
 def compiled_loop(*, days: int = 14, runs: int = 5) -> list[Figure]:
@@ -131,8 +119,8 @@ def compiled_loop(*, days: int = 14, runs: int = 5) -> list[Figure]:
             pool.map(_seven_modes, [(seed, days), (seed + 1, days)], chunksize=1)
             both.append(2 * len(MODES) * days / (time.perf_counter() - start))
     return [
-        _figure("closed-loop/compiled", values, ceilings),
-        _figure("closed-loop/compiled/2", both, [2 * value for value in values]),
+        figure("closed-loop/compiled", UNIT, values, ceilings),
+        figure("closed-loop/compiled/2", UNIT, both, [2 * value for value in values]),
     ]
 
 

@@ -10,7 +10,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 
 from e2e.p02 import e2e_p02_protect
 
@@ -20,7 +19,7 @@ from can_bus.lockstep import STEPS_PER_DAY
 from firmware_sim.firmware import Firmware
 from plant_server.server import PlantServer
 from pumpbench import rig
-from pumpbench.benchmark.round_trips import Figure
+from pumpbench.benchmark.round_trips import Figure, figure
 from pumpbench.capture import Capture
 from pumpbench.closed_loop import Case, simulate
 from pumpbench.recorder import write
@@ -45,14 +44,6 @@ def figures(*, quick: bool) -> list[Figure]:
         memory(days=1 if quick else 14, patients=2 if quick else 10),
         patients(days=1 if quick else 14, runs=runs),
     ]
-
-
-def _figure(name: str, unit: str, values: list[float], ceilings: list[float]) -> Figure:
-    value, ceiling = median(values), median(ceilings)
-    return Figure(
-        name=name, value=round(value, 2), unit=unit, ceiling=round(ceiling, 2), ratio=round(value / ceiling, 3),
-        runs=len(values),
-    )  # fmt: skip
 
 
 def _rate(work: Callable[[], object], count: int) -> float:
@@ -80,7 +71,7 @@ def codec_speed(*, count: int, runs: int) -> list[Figure]:
     for name, (ours, other) in pairs.items():
         _rate(ours, 100), _rate(other, 100)
         samples = [(_rate(ours, count), _rate(other, count)) for _ in range(runs)]
-        found.append(_figure(name, "frames/s", [one for one, _ in samples], [one for _, one in samples]))
+        found.append(figure(name, "frames/s", [one for one, _ in samples], [one for _, one in samples]))
     return found
 
 
@@ -110,7 +101,7 @@ def recorder(*, days: int, runs: int) -> list[Figure]:
             write(RunFolder.create(request.out), capture, prepared.info, complete=True)
             writing.append(days / (time.perf_counter() - start))
     unit = "patient-days/s"
-    return [_figure("recorder/listening", unit, listening, deaf), _figure("recorder/writing", unit, writing, listening)]
+    return [figure("recorder/listening", unit, listening, deaf), figure("recorder/writing", unit, writing, listening)]
 
 
 def start_up(*, runs: int) -> list[Figure]:
@@ -125,7 +116,7 @@ def start_up(*, runs: int) -> list[Figure]:
     simulate(Case(PATIENT, days=1))  # its code is on disk from here on
     bare = [_started(["-c", "pass"]) for _ in range(runs)]
     return [
-        _figure(name, "starts/s", [_started(arguments) for _ in range(runs)], bare)
+        figure(name, "starts/s", [_started(arguments) for _ in range(runs)], bare)
         for name, arguments in commands.items()
     ]
 
@@ -146,7 +137,7 @@ def memory(*, days: int, patients: int) -> Figure:
     )
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
     unit = 1024.0 if sys.platform != "darwin" else 1024.0 * 1024.0
-    return _figure("memory/campaign", "MiB", [int(done.stdout) / unit], [MEMORY_CEILING_MIB])
+    return figure("memory/campaign", "MiB", [int(done.stdout) / unit], [MEMORY_CEILING_MIB])
 
 
 def patients(*, days: int, runs: int) -> Figure:
@@ -162,4 +153,4 @@ def patients(*, days: int, runs: int) -> Figure:
     rate([(name, 0) for name in cohort])
     many = [rate([(name, run) for name in cohort]) for run in range(1, runs + 1)]
     one = [rate([(PATIENT, 100 * run + number) for number in range(10)]) for run in range(1, runs + 1)]
-    return _figure("scaling/ten patients", "patient-days/s", many, one)
+    return figure("scaling/ten patients", "patient-days/s", many, one)

@@ -79,16 +79,16 @@ def round_trips(kinds: list[str] | None = None, *, steps: int = 3000, runs: int 
     for kind in _present(kinds):
         ours, bare = _runs(kind, steps, runs, n_to=1, n_back=1, listener=False)
         name = f"round-trips/{kind}"
-        figures.append(_figure(name, "1/s", [s.rate for s in ours], [s.rate for s in bare]))
-        figures.append(_figure(f"{name}/p50", "us", [s.p50 for s in ours], [s.p50 for s in bare], lower=True))
-        figures.append(_figure(f"{name}/p99", "us", [s.p99 for s in ours], [s.p99 for s in bare], lower=True))
+        figures.append(figure(name, "1/s", [s.rate for s in ours], [s.rate for s in bare]))
+        figures.append(figure(f"{name}/p50", "us", [s.p50 for s in ours], [s.p50 for s in bare], lower=True))
+        figures.append(figure(f"{name}/p99", "us", [s.p99 for s in ours], [s.p99 for s in bare], lower=True))
     return figures
 
 
 def pattern(url_kind: str, n_to: int, n_back: int, *, steps: int = 3000, runs: int = 7) -> Figure:
     """Return the rate of a lockstep step's traffic: ``n_to`` frames out, ``n_back`` back, and a passive listener."""
     ours, bare = _runs(url_kind, steps, runs, n_to=n_to, n_back=n_back, listener=True)
-    return _figure(f"steps/{url_kind}/{n_to}+{n_back}", "1/s", [s.rate for s in ours], [s.rate for s in bare])
+    return figure(f"steps/{url_kind}/{n_to}+{n_back}", "1/s", [s.rate for s in ours], [s.rate for s in bare])
 
 
 def _present(kinds: list[str] | None) -> list[str]:
@@ -108,14 +108,15 @@ def _runs(
     return ours, bare
 
 
-def _figure(name: str, unit: str, ours: list[float], bare: list[float], *, lower: bool = False) -> Figure:
+def figure(name: str, unit: str, ours: list[float], bare: list[float], *, lower: bool = False) -> Figure:
+    """Medians of both, and their ratio; `lower`: the smaller value is the better one."""
     value, ceiling = median(ours), median(bare)
     ratio = ceiling / value if lower else value / ceiling
     return Figure(
         name=name,
-        value=round(value, 1),
+        value=round(value, 2),
         unit=unit,
-        ceiling=round(ceiling, 1),
+        ceiling=round(ceiling, 2),
         ratio=round(ratio, 3),
         runs=len(ours),
     )

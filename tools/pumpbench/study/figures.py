@@ -19,8 +19,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MultipleLocator
 
+from pumpbench.files import write_file
 from pumpbench.study import paper, statistics
-from pumpbench.study.tables import write_file
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -13,6 +13,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from pumpbench.files import write_file
 from pumpbench.study import figures, paper, statistics, tables
 
 PAPER_PATIENTS, PAPER_DAYS = 10, 14
@@ -109,7 +110,7 @@ def write_report(
         sensitivity=sensitivity,
         settings=settings or {},
     )
-    tables.write_file(folder / "report.html", text.encode())
+    write_file(folder / "report.html", text.encode())
     return folder / "report.html"
 
 

@@ -18,6 +18,7 @@ import pandas as pd
 from plant_server.scenario import load_scenario
 from pumpbench import campaign
 from pumpbench.campaign import Job, Results
+from pumpbench.files import write_file
 from pumpbench.study import figures, paper, plan, report, statistics, tables
 from pumpbench.study.plan import Cohort, Law
 
@@ -59,6 +60,7 @@ class Study:
         self._settings = settings
         self._say = say
         self._progress = progress
+        self._results = Results(settings.out / "results")
         self._jobs = 0
 
     def run(self) -> Path:
@@ -72,7 +74,7 @@ class Study:
         cohort, days, seeds = settings.cohort, settings.days, settings.seeds
         law, law_tables = self._law()
         law, tuning = self._strategies(law)
-        (settings.out / "controller.json").write_text(json.dumps(dataclasses.asdict(law), indent=1) + "\n")
+        write_file(settings.out / "controller.json", (json.dumps(dataclasses.asdict(law), indent=1) + "\n").encode())
 
         validation = plan.validation_jobs(cohort, days, law, seeds, series=1)
         ratio = plan.validation_jobs(
@@ -157,22 +159,19 @@ class Study:
         settings = self._settings
         self._say(f"{what}: {len(jobs)} runs of {settings.days} days")
         self._jobs += len(jobs)
-        return self._results(jobs).table(jobs).to_pandas()
-
-    def _results(self, jobs: Sequence[Job]) -> Results:
-        settings = self._settings
-        return campaign.execute(
+        campaign.execute(
             jobs,
-            settings.out / "results",
+            self._results,
             workers=settings.workers,
             cluster=settings.cluster,
             via=settings.via,
             progress=self._progress,
         )
+        return self._results.table(jobs).to_pandas()
 
     def _curves(self, jobs: Sequence[Job]) -> dict[tuple[str, str, int], figures.Curves]:
         kept = [job for job in jobs if job.series]
-        table = Results(self._settings.out / "results").table(kept, campaign.SERIES)
+        table = self._results.table(kept, campaign.SERIES)
         return {
             (job.patient, job.mode, job.seed): figures.Curves(
                 *(np.asarray(row[name], np.float64) for name in campaign.SERIES)

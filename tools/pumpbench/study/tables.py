@@ -5,8 +5,6 @@ Text with fixed formats, so that equal results are equal bytes, and each file is
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from pumpbench.files import write_file
 from pumpbench.study import paper, statistics
 
 FURTHER: Final = ("mean_glucose", "cv", "gmi", "gri", "limiter_steps")
@@ -31,20 +30,6 @@ def write_table(path: Path, table: pd.DataFrame) -> None:
     """A table as CSV: numbers with four decimals, p with four digits, true/false, nothing where there is no number."""
     text = pd.DataFrame({str(name): [_cell(str(name), value) for value in table[name]] for name in table})
     write_file(path, text.to_csv(index=False, lineterminator="\n").encode())
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """The file whole or not at all; the folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=path.name, suffix=".partial", dir=path.parent)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except OSError:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _cell(column: str, value: Any) -> str:
