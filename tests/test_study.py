@@ -4,11 +4,12 @@ import csv
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 from conftest import Pumpbench
-from pumpbench.study import plan
+from pumpbench.study import paper, plan, run
 from pumpbench.study.run import variations
 
 SMALL = ("--patient", "adult#002,adult#005", "--days", "1", "--seeds", "1001-1002", "--quick")
@@ -112,3 +113,25 @@ def test_curves_are_kept_of_the_first_seed(seeds: tuple[int, ...]) -> None:
     cohort = plan.Cohort(("adult#001",))
     jobs = plan.validation_jobs(cohort, 1, plan.Law(12.0, {"adult#001": 0.6}, 0.85), seeds, series=1)
     assert {job.seed for job in jobs if job.series} == {1}
+
+
+def test_curves_of_a_ratio_are_of_that_ratio_whatever_was_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found by looking at the figure: the validation's own ratio had been drawn under the name of 10 ug/U."""
+    for name, values in {
+        "THETAS": (12.0,), "GAINS": (0.6,), "DEDUCTIONS": (0.85,), "Z1": (2.0,), "Z2": (1.0,), "Z3": (12,),
+        "DOSES": dict.fromkeys(paper.STRATEGIES, (3.0,)),
+    }.items():  # fmt: skip
+        monkeypatch.setattr(plan, name, values)
+    told: dict[str, Any] = {}
+    monkeypatch.setattr(run.report, "write_report", lambda *_, **named: told.update(named))
+    cohort = plan.Cohort(("adult#002", "adult#005"))
+    run.Study(run.Settings(tmp_path, cohort, 1, (1001,), workers=1, quick=True), print, lambda *_: None).run()
+    for mode in ("s2", "s4"):
+        chosen, six, ten = (
+            sum(float(told[name][patient, mode, 1001].plasma_pramlintide.sum()) for patient in cohort.patients)
+            for name in ("curves", "six", "ten")
+        )
+        assert ten / six == pytest.approx(10 / 6, rel=0.1)
+        assert chosen / six == pytest.approx(3 / 6, rel=0.2)  # with less pramlintide there is more insulin

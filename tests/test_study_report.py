@@ -84,6 +84,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
         others=[report.ResultSet("public data only", worse)],
         curves=made_up_curves(("nma", "s1", "s2", "s4")),
         six=made_up_curves(("s2", "s4")),
+        ten=made_up_curves(("s2", "s4")),
         meals=MEALS,
         sensitivity=pd.DataFrame({"parameter": ["n", "<d>"], "S2": [97.1, 96.25]}),
         explanations={"lbgi": "the cohort's <basal>", "nma s4 lbgi": "of its own"},

@@ -80,11 +80,13 @@ def write_figures(
     curves: CurveSet | None = None,
     six: CurveSet | None = None,
     meals: Sequence[Meal] = (),
+    ten: CurveSet | None = None,
 ) -> dict[str, Path]:
     """All figures there are data for, by name.
 
     They are contrasts, tuning_s1 to tuning_s4, strategies_over_time and ratio_6_and_10. `curves` and `meals` are those
-    of the validation, `six` the curves of strategies 2 and 4 with 6 ug/U. Of several seeds the first is drawn, since an
+    of the validation, whose ratio is the chosen one; `six` and `ten` the curves of strategies 2 and 4 with 6 and with
+    10 ug/U. Of several seeds the first is drawn, since an
     average over seeds would hide how a run looks.
     """
     figures = {"contrasts": contrasts_figure(statistics.compare(statistics.contrasts(statistics.validation(runs))))}
@@ -95,8 +97,8 @@ def write_figures(
             figures[f"tuning_{strategy}"] = tuning_figure(part, strategy)
     if curves and any(mode in STYLES for _, mode, _ in curves):
         figures["strategies_over_time"] = strategies_figure(curves, meals)
-    if curves and six and {mode for _, mode, _ in six} & {mode for _, mode, _ in curves} & {"s2", "s4"}:
-        figures["ratio_6_and_10"] = ratio_figure(curves, six, meals)
+    if ten and six and {mode for _, mode, _ in six} & {mode for _, mode, _ in ten} & {"s2", "s4"}:
+        figures["ratio_6_and_10"] = ratio_figure(ten, six, meals)
     for name, figure in figures.items():
         write_file(folder / f"{name}.png", png(figure))
     return {name: folder / f"{name}.png" for name in figures}

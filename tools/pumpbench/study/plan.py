@@ -242,3 +242,11 @@ def validation_jobs(
         )
         for patient in cohort.patients for seed in seeds for mode in modes
     ]  # fmt: skip
+
+
+def ratio_jobs(cohort: Cohort, days: int, law: Law, seeds: Sequence[int], ratio: float) -> list[Job]:
+    """Strategies 2 and 4 of the validation with another ratio, ug/U; the curves of the first seed are kept."""
+    return validation_jobs(
+        cohort, days, law, seeds, part="dose_ratio", modes=("s2", "s4"), series=1,
+        changes={"pram_ratio": ratio}, swept=(("ratio_ug_per_u", ratio),), label=f"ratio={ratio:g}",
+    )  # fmt: skip

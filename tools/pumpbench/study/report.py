@@ -35,6 +35,7 @@ def write_report(
     others: Sequence[ResultSet] = (),
     curves: figures.CurveSet | None = None,
     six: figures.CurveSet | None = None,
+    ten: figures.CurveSet | None = None,
     meals: Sequence[figures.Meal] = (),
     sensitivity: pd.DataFrame | None = None,
     explanations: Mapping[str, str] | None = None,
@@ -47,8 +48,9 @@ def write_report(
         folder: where to; made if it is not there, files of the same names are replaced.
         results: what the tables and figures are about.
         others: further sets to show beside it; their validation part is enough.
-        curves: the validation's, `six` those of strategies 2 and 4 with 6 ug/U, `meals` the validation's.
-        six: see curves.
+        curves: the validation's, as its `meals`; its ratio is the chosen one.
+        six: of strategies 2 and 4 with 6 ug/U.
+        ten: the same with 10 ug/U.
         meals: see curves.
         sensitivity: a table shown as it is, its column names as headings.
         explanations: why something does not agree, by "nma s2 hbgi" (comparator, strategy, metric), by "s2 hbgi" (the
@@ -64,7 +66,7 @@ def write_report(
     runs = results.runs
     alone = statistics.validation(runs)
     tables.write_tables(folder, runs)
-    drawn = figures.write_figures(folder, runs, curves, six, meals)
+    drawn = figures.write_figures(folder, runs, curves, six, meals, ten)
 
     def picture(name: str, caption: str) -> Markup:
         if name not in drawn:

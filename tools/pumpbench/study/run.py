@@ -77,15 +77,8 @@ class Study:
         write_file(settings.out / "controller.json", (json.dumps(dataclasses.asdict(law), indent=1) + "\n").encode())
 
         validation = plan.validation_jobs(cohort, days, law, seeds, series=1)
-        ratio = plan.validation_jobs(
-            cohort, days, law, seeds, part="dose_ratio", modes=("s2", "s4"), series=1,
-            changes={"pram_ratio": 6.0}, swept=(("ratio_ug_per_u", 6.0),), label="ratio=6",
-        )  # fmt: skip
-        ratio += plan.validation_jobs(
-            cohort, days, law, seeds, part="dose_ratio", modes=("s2", "s4"),
-            changes={"pram_ratio": 10.0}, swept=(("ratio_ug_per_u", 10.0),), label="ratio=10",
-        )  # fmt: skip
-        runs = self._table("validation and the two ratios", [*validation, *ratio])
+        six, ten = (plan.ratio_jobs(cohort, days, law, seeds, ratio) for ratio in statistics.RATIOS)
+        runs = self._table("validation and the two ratios", [*validation, *six, *ten])
         runs = pd.concat([tuning, runs], ignore_index=True)
         others, sensitivity = [], None
         if not settings.quick:
@@ -94,15 +87,14 @@ class Study:
             sensitivity = self._sensitivity(law)
         for name, table in law_tables.items():
             tables.write_table(settings.out / f"law_{name}.csv", table)
-        curves = self._curves(validation)
-        six = self._curves([job for job in ratio if job.series])
         scenario = load_scenario("validation-14d", seed=seeds[0], patient=cohort.patients[0], days=days)
         return report.write_report(
             settings.out,
             report.ResultSet("P2", runs, CALIBRATED),
             others=others,
-            curves=curves,
-            six=six,
+            curves=self._curves(validation),
+            six=self._curves(six),
+            ten=self._curves(ten),
             meals=[(meal.step * STEP_MINUTES, meal.carbs_g) for meal in scenario.meals],
             sensitivity=sensitivity,
             explanations=EXPLANATIONS,
