@@ -80,7 +80,7 @@ def test_replies(bench: Bench, line: str, reply: list[str]) -> None:
 
 def test_version_and_help_and_prompt(bench: Bench) -> None:
     console = Console(bench.firmware)  # type: ignore[arg-type]
-    assert console.feed(b"version\n").startswith(b"version\r\nfirmware=0.2 protocol=1.2 dbc_crc=")
+    assert console.feed(b"version\n").startswith(b"version\r\nfirmware=0.2 protocol=1.3 dbc_crc=")
     assert console.feed(b"\r\n").endswith(b"> ")
     assert console.feed(b"helq\x7fp\r").count(b"\r\n") == 11
 
