@@ -1,5 +1,6 @@
 """YAML files people write by hand: validated with pydantic, every error with file and line."""
 
+import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -64,7 +65,7 @@ def _refuse_repeated_keys(path: Path, root: yaml.Node | None) -> None:
 def _problem(path: Path, root: yaml.Node | None, model: type[BaseModel], problem: object) -> str:
     assert isinstance(problem, dict)
     location = problem["loc"]
-    place = ".".join(str(part) for part in _without_kinds(root, location)) or "top level"
+    place = ".".join(map(str, _without_kinds(root, location, last=problem["type"] != "missing"))) or "top level"
     found = problem.get("input")
     shown = "" if isinstance(found, dict | list) or found is None else f" (found {found!r})"
     text = problem["msg"].removeprefix("Value error, ")
@@ -74,15 +75,22 @@ def _problem(path: Path, root: yaml.Node | None, model: type[BaseModel], problem
         text = "this key is missing"
     elif problem["type"] == "model_type":
         text = f"expected a mapping with the keys {', '.join(_keys(model, (*location, '')))}"
+    elif problem["type"] in ("union_tag_not_found", "model_attributes_type"):
+        text = "expected a mapping with the key kind"
+    elif problem["type"] == "union_tag_invalid":
+        tags = [tag.strip(" '") for tag in problem["ctx"]["expected_tags"].split(",")]
+        near = difflib.get_close_matches(problem["ctx"]["tag"], tags, 3)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(tags)}"
+        text, shown = f"there is no kind {problem['ctx']['tag']!r}; {hint}", ""
     return f"{path}:{_line(root, location)}: {place}: {text}{shown}"
 
 
-def _without_kinds(node: yaml.Node | None, location: Sequence[object]) -> list[object]:
-    """The location as the file has it: a pydantic union puts the chosen kind in between."""
+def _without_kinds(node: yaml.Node | None, location: Sequence[object], *, last: bool) -> list[object]:
+    """The location as the file has it: a pydantic union puts the chosen kind in between, or `last`."""
     kept: list[object] = []
     for number, part in enumerate(location):
         entries = {pair[0].value: pair[1] for pair in node.value} if isinstance(node, yaml.MappingNode) else {}
-        if isinstance(node, yaml.MappingNode) and part not in entries and number < len(location) - 1:
+        if isinstance(node, yaml.MappingNode) and part not in entries and (last or number < len(location) - 1):
             continue
         kept.append(part)
         if isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):

@@ -207,9 +207,7 @@ class Firmware:
         self._last_change = -STEP_SNA
 
     def start(self) -> list[Frame]:
-        """What the device says by itself after a reset in the middle of a run, to be sent before it listens."""
-        if not self._reset_here:
-            return []
+        """What the device says when it starts, before it listens: it cannot know that no run is on."""
         self._send_heartbeat(NMT_BOOT_UP)
         return self._turn.take()
 
@@ -783,3 +781,7 @@ class Firmware:
             found |= Failure.MEMORY
         self._failures |= found
         return found
+
+    def load(self, task: int, work: int) -> bool:
+        """Give a task more work in its next run; False if there is no such task."""
+        return self._scheduler.load(task, work)

@@ -34,7 +34,8 @@ FORMAT_ISO_14229 = 1
 ALL_DTCS = 0xFFFFFF
 
 START, RESULTS = 1, 3
-SELF_TEST = 0x0200
+SELF_TEST, LOAD = 0x0200, 0x0201
+"""Routines: the self test; more work for a task in the next step, to test the watchdog."""
 
 FAILED, FAILED_THIS_CYCLE, CONFIRMED, FAILED_SINCE_CLEAR = 0x01, 0x02, 0x08, 0x20
 AVAILABLE = FAILED | FAILED_THIS_CYCLE | CONFIRMED | FAILED_SINCE_CLEAR
@@ -74,6 +75,9 @@ class Device(Protocol):
 
     def self_test(self) -> int:
         """Run it; bits of what failed."""
+
+    def load(self, task: int, work: int) -> bool:
+        """Give a task more work in its next run; False if there is no such task."""
 
 
 class _Refused(Exception):
@@ -180,6 +184,8 @@ class Uds:
 
     def _on_routine(self, data: bytes) -> bytes:
         self._need_extended()
+        if data[1:3] == LOAD.to_bytes(2, "big"):
+            return self._on_load(data)
         subfunction = self._subfunction(data, 3, (START, RESULTS))
         if int.from_bytes(data[1:], "big") != SELF_TEST:
             raise _Refused(OUT_OF_RANGE)
@@ -188,6 +194,13 @@ class Uds:
         if self._result is None:
             raise _Refused(SEQUENCE)
         return data + bytes([self._result])
+
+    def _on_load(self, data: bytes) -> bytes:
+        """Start alone: the number of a task and two bytes of work."""
+        self._subfunction(data, 6, (START,))
+        if not self._device.load(data[3], int.from_bytes(data[4:], "big")):
+            raise _Refused(OUT_OF_RANGE)
+        return data[:3]
 
     def _need_extended(self) -> None:
         if self._session != EXTENDED:

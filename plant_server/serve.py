@@ -42,10 +42,10 @@ def serve(
         PlantError: the device broke the protocol.
         BusLost: the bus is gone or lost frames.
     """
+    PlantServer(plant.run).rehearse()  # while nobody waits: a hub in this process stands still meanwhile
     calling = True
-    deadline = time.monotonic() + connect_timeout
-    answer = plant.call_roll()
-    link.send(answer)
+    link.send(plant.call_roll())
+    heard = called = time.monotonic()  # others may talk on the bus all the time: only what is answered counts
     while not plant.finished:
         frames = link.recv(ROLL_CALL_EVERY if calling else WATCH_EVERY)
         answered = False
@@ -56,15 +56,19 @@ def serve(
                 answered = True
         if answered:
             calling = False
-            deadline = time.monotonic() + step_timeout
+            heard = time.monotonic()
             if plant.step % 16 == 0:
                 progress(plant.step)
-        elif not plant.finished and not frames:
+            continue
+        if not frames:
             watch()
-            if time.monotonic() > deadline:
-                raise MemberSilent(_silence(plant, connect_timeout if calling else step_timeout))
-            if calling:
-                link.send(plant.call_roll())
+        now = time.monotonic()
+        patience = connect_timeout if calling else step_timeout
+        if not plant.finished and now > heard + patience:
+            raise MemberSilent(_silence(plant, patience))
+        if calling and now >= called + ROLL_CALL_EVERY:
+            called = now
+            link.send(plant.call_roll())
 
 
 def _silence(plant: PlantServer, seconds: float) -> str:

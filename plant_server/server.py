@@ -256,6 +256,10 @@ class PlantServer:
 
     # ---- between two instants
 
+    def rehearse(self) -> None:
+        """Do an interval without a device, so that compiled code is loaded; this plant is of no use afterwards."""
+        self._advance()
+
     def _advance(self) -> None:
         insulin, pramlintide = self._pump.deliver(self.step)
         for chamber in (self._pump.insulin, self._pump.pramlintide):

@@ -14,7 +14,7 @@ from can_bus import codec, gateway
 from can_bus.codec import Transmitter
 from can_bus.faults import Drop, Fault, Injector, load_faults, seconds
 from can_bus.frame import CAN_RTR_FLAG, Frame
-from can_bus.gateway import Gateway
+from can_bus.gateway import Gateway, Side
 from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.lockstep import STEP_SECONDS, Done, Phase
@@ -81,7 +81,7 @@ def test_a_fault_file(tmp_path: Path) -> None:
         "    message: PUMP_BasalCmd\n"
         "    start: 1+04:00\n"
         "    count: 3\n"
-        "  - message: HB_PUMP\n",
+        "  - {kind: drop, message: HB_PUMP}\n",
     )
     assert load_faults(path) == (
         Drop(message="CGM_Reading", start="02:00", end="03:00"),
@@ -95,7 +95,11 @@ def test_a_fault_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "line", "expected"),
     [
-        ("faults:\n  - {kind: drip, message: CGM_Reading}\n", 2, r"faults\.0\.kind: .*'drop'.*\(found 'drip'\)"),
+        (
+            "faults:\n  - {kind: drip, message: CGM_Reading}\n",
+            2,
+            r"faults\.0: there is no kind 'drip'; did you mean drop\?",
+        ),
         (
             "faults:\n  - kind: drop\n    message: CGM_Readng\n",
             3,
@@ -111,8 +115,10 @@ def test_a_fault_file(tmp_path: Path) -> None:
         (
             'faults:\n  - kind: drop\n    message: CGM_Reading\n    strat: "02:00"\n',
             4,
-            r"faults\.0\.strat: unknown key; expected one of kind, message, start, end, count",
+            r"faults\.0\.strat: unknown key; expected one of kind, start, end, message, when, nth, ",
         ),
+        ("faults:\n  - {message: CGM_Reading}\n", 2, r"faults\.0: expected a mapping with the key kind"),
+        ("faults:\n  - {kind: xyz}\n", 2, r"there is no kind 'xyz'; there are drop, delay, .*"),
         ("faults:\n  - {kind: drop}\n", 2, r"faults\.0\.message: this key is missing"),
         (
             "faults:\n"
@@ -126,20 +132,28 @@ def test_a_fault_file(tmp_path: Path) -> None:
             2,
             r"end must be later than start",
         ),
-        ("faults:\n  - message: CGM_Reading\n    count: 0\n", 3, r"faults\.0\.count: .*greater than .*\(found 0\)"),
         (
-            "faults:\n  - message: CGM_Reading\n    start: 12:00\n",  # a number in YAML: base 60
-            3,
+            "faults:\n  - kind: drop\n    message: CGM_Reading\n    count: 0\n",
+            4,
+            r"faults\.0\.count: .*greater than .*\(found 0\)",
+        ),
+        (
+            "faults:\n  - kind: drop\n    message: CGM_Reading\n    start: 12:00\n",  # a number in YAML: base 60
+            4,
             r"faults\.0\.start: a time is .*in quotes.*\(found 720\)",
         ),
-        ("faults:\n  - message: CGM_Reading\n    end: '25:00'\n", 3, r"faults\.0\.end: a time is .*\(found '25:00'\)"),
+        (
+            "faults:\n  - kind: drop\n    message: CGM_Reading\n    end: '25:00'\n",
+            4,
+            r"faults\.0\.end: a time is .*\(found '25:00'\)",
+        ),
         ("faults:\n  - message: CGM_Reading\n    message: PUMP_Ack\n", 3, r"the key message stands there twice"),
         ("- {kind: drop, message: CGM_Reading}\n", 1, r"top level: expected a mapping with the keys faults"),
         ("", 1, r"top level: expected a mapping with the keys faults"),
         ("# nothing\n", 1, r"top level: expected a mapping with the keys faults"),
         ("faults:\n", 1, r"faults: .*list"),
         ("faults: {kind: drop, message: CGM_Reading}\n", 1, r"faults: .*list"),
-        ("faults:\n  - CGM_Reading\n", 2, r"faults\.0: expected a mapping with the keys kind, message, start, end, c"),
+        ("faults:\n  - CGM_Reading\n", 2, r"faults\.0: expected a mapping with the key kind \(found 'CGM_Reading'\)"),
         ("fault: []\n", 1, r"fault: unknown key; expected one of faults"),
         ("faults:\n  - {kind: drop\n  x: [\n", 3, r"not YAML: "),
         ("faults:\n\t- x\n", 2, r"not YAML: .*'\\t'"),
@@ -174,7 +188,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_at_most_three_errors_are_told_at_once(tmp_path: Path) -> None:
-    path = write(tmp_path, "faults:\n" + "  - {message: CGM_Readng}\n" * 9)
+    path = write(tmp_path, "faults:\n" + "  - {kind: drop, message: CGM_Readng}\n" * 9)
     with pytest.raises(FileError) as error:
         load_faults(path)
     assert re.findall(r"yaml:(\d+): ", str(error.value)) == ["2", "3", "4"]
@@ -191,15 +205,15 @@ def test_a_file_that_contains_itself(tmp_path: Path, text: str) -> None:
 
 def test_a_fault_acts_from_its_start_until_before_its_end() -> None:
     fault = Drop(message="CGM_Reading", start="02:00", end="03:00")
-    assert [fault.covers(second, 0) for second in (0, 7199, 7200, 10799, 10800)] == [False, False, True, True, False]
-    assert Drop(message="CGM_Reading").covers(0, 0)
-    assert Drop(message="CGM_Reading", start="02:00").covers(10**7, 10**6)
+    assert [fault.open(second) for second in (0, 7199, 7200, 10799, 10800)] == [False, False, True, True, False]
+    assert Drop(message="CGM_Reading").open(0)
+    assert Drop(message="CGM_Reading", start="02:00").open(10**7)
 
 
 def test_a_fault_acts_so_often_and_no_more() -> None:
     injector = Injector((Drop(message="CGM_Reading", start="00:10", count=2),))
     frame = Transmitter().frame("CGM_Reading")
-    kept = [bool(injector.apply(frame, second)[0]) for second in range(0, 3000, 300)]
+    kept = [bool(injector.apply(frame, second, "device")[0]) for second in range(0, 3000, 300)]
     assert kept == [True, True, False, False, True, True, True, True, True, True]
 
 
@@ -208,7 +222,7 @@ def test_every_injection_is_reported() -> None:
                             "PLANT_Truth": "Bus", "CFG_Param": "Bus"}.items():  # fmt: skip
         injector = Injector((Drop(message=message),))
         sent = Transmitter().frame(message)
-        passed, reports = injector.apply(sent, 86400 + 7200)
+        passed, reports = injector.apply(sent, 86400 + 7200, "device")
         assert passed == []
         (report,) = reports
         assert report.can_id == FAULT_ID
@@ -226,13 +240,13 @@ def test_only_the_message_of_the_fault_is_touched() -> None:
     transmitter = Transmitter()
     for name in codec.messages():
         frame = transmitter.frame(name)
-        passed, reports = injector.apply(frame, 0)
+        passed, reports = injector.apply(frame, 0, "device")
         if name in ("CGM_Reading", "PUMP_Ack"):
             assert (passed, len(reports)) == ([], 1)  # two faults on one frame: the first one has it
         else:
             assert (passed, reports) == ([frame], [])
     ours = Frame(codec.message("CGM_Reading").can_id | CAN_RTR_FLAG, bytes(8))
-    assert injector.apply(ours, 0) == ([ours], [])
+    assert injector.apply(ours, 0, "device") == ([ours], [])
 
 
 # ---- the gateway's time
@@ -251,7 +265,9 @@ class Bench:
 
     def put(self, frame: Frame) -> list[Frame]:
         self.sent.append(frame)
-        out = self.gateway.forward(frame)
+        source = Side.DEVICE if codec.messages_by_id()[frame.can_id].sender == "CTRL" else Side.PLANT
+        crossing = self.gateway.forward(frame, source)
+        out = crossing.device + crossing.plant
         self.arrived += out
         inject = codec.message("FAULT_Inject")
         for report in out:

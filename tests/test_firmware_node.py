@@ -682,8 +682,11 @@ def test_every_change_of_state_is_told_in_the_same_step(seed: int, confirming: b
     assert {(uncertain, auto), (uncertain, degraded), (uncertain, safe)} & pairs
 
 
-def test_a_device_that_was_not_reset_says_nothing_by_itself() -> None:
-    assert Firmware().start() == []
+def test_a_device_that_starts_says_so_before_it_listens() -> None:
+    """It cannot know whether a run is on: the bench may have taken its power away, and its memory too."""
+    (frame,) = Firmware().start()
+    assert codec.messages_by_id()[frame.can_id].name == "HB_CTRL"
+    assert codec.message("HB_CTRL").unpack(frame.data)["NmtCtrl"] == 0
 
 
 def test_an_alarm_that_is_not_in_force_is_not_renewed() -> None:

@@ -19,6 +19,7 @@ SCRIPTS = {
 
 STOPS_AT_STEP = """
 import sys
+import time
 from can_bus import open_link
 from firmware_sim.firmware import Firmware
 firmware = Firmware()
@@ -37,6 +38,9 @@ DIES = {
     "hangs": ("import time; time.sleep(60)", "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
     "wrong step": ("link.send([firmware._transmitter.frame('SYNC_Done', DoneStatus=0, DoneStepIndex=7)]); continue",
                    "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
+    "talks on and on": (
+        "[(link.send([firmware._transmitter.frame('CTRL_Diag')] * 10), time.sleep(0.001)) for _ in iter(int, 1)]",
+        "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
     "asks for turns for ever": (
         "link.send([firmware._transmitter.frame('SYNC_Done', DoneStatus=3, DoneStepIndex=20)]); continue",
         "asked for more than 32 turns in step 20"),

@@ -25,6 +25,7 @@ from udsoncan.exceptions import NegativeResponseException
 import dbc
 from can_bus.codec import message
 from can_bus.frame import Frame
+from can_bus.lockstep import Done
 from firmware_sim import selftest
 from firmware_sim.alarms import Code
 from firmware_sim.firmware import NVM_WORDS, Firmware
@@ -190,7 +191,12 @@ def test_several_identifiers_at_once(station: Station) -> None:
         ("03", "11 01 01", "7f1113"),
         ("03", "31 02 02 00", "7f3112"),
         ("03", "31 01 02", "7f3113"),
-        ("03", "31 01 02 01", "7f3131"),
+        ("03", "31 01 02 03", "7f3131"),
+        ("01", "31 01 02 01 01 00 05", "7f317f"),
+        ("03", "31 01 02 01", "7f3113"),
+        ("03", "31 03 02 01 01 00 05", "7f3112"),
+        ("03", "31 01 02 01 07 00 05", "7f3131"),
+        ("03", "31 01 02 01 06 00 05", "71010201"),
         ("03", "31 03 02 00", "7f3124"),
         ("03", "27 01", "7f2711"),  # no security access,
         ("03", "2E F1 90 00", "7f2e11"),  # no writing,
@@ -212,6 +218,16 @@ def test_an_answer_that_is_not_wanted_is_not_sent(station: Station, request_: st
     assert list(station.firmware.receive(Frame(REQUEST, bytes([len(data)]) + data))) == []
     # a refusal is sent all the same
     assert station.ask("3E 81") == "7f3e12"
+
+
+def test_a_load_makes_its_task_late_for_one_step(station: Station) -> None:
+    station.ask("1003")
+    request = bytes.fromhex("07 31 81 02 01 01 03 E8".replace(" ", ""))  # task 1, the sensor's, 1000 more
+    assert list(station.firmware.receive(Frame(REQUEST, request))) == []
+    turn = station.bench.step()
+    assert turn.done["DoneStatus"] == Done.OVERRUN and turn.alarms(Code.WATCHDOG)
+    assert turn.done["ExecTime"] > 1000
+    assert station.bench.step().done["DoneStatus"] == Done.OK
 
 
 def test_the_tool_gets_exceptions_it_understands(station: Station) -> None:
@@ -393,7 +409,21 @@ def test_frames_of_other_kinds_are_nobodys(station: Station, can_id: int) -> Non
 def test_with_udsoncan_over_the_hub_and_a_reset_in_the_middle(tmp_path: Path) -> None:
     url, nvm = f"unix:{tmp_path / 'bus'}", tmp_path / "nvm"
     plant = subprocess.Popen(
-        [sys.executable, "-m", "pumpbench", "plant", "--bus", url, "--host", "--strategy", "s3", "--days", "14"],
+        [
+            sys.executable,
+            "-m",
+            "pumpbench",
+            "plant",
+            "--bus",
+            url,
+            "--host",
+            "--strategy",
+            "s3",
+            "--scenario",
+            "camerlingo",
+            "--days",
+            "60",
+        ],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -426,7 +456,7 @@ def test_with_udsoncan_over_the_hub_and_a_reset_in_the_middle(tmp_path: Path) ->
         if firmware is not None:
             firmware.kill()
         plant.kill()
-    assert "done: 4032 steps" in plant.communicate()[0]
+    assert "done: 17280 steps" in plant.communicate()[0]
 
 
 def test_the_example_says_what_it_needs() -> None:

@@ -1,5 +1,6 @@
-"""Fault files: what is written together acts in three places, on the wire, in the pump and in the sensor."""
+"""Fault files: what is written together acts on the wire, on the device, in the pump and in the sensor."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -7,11 +8,16 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from can_bus import yaml_file
-from can_bus.faults import Drop
+from can_bus.faults import Fault as WireFault
+from can_bus.faults import WireFaults
 from plant_server.faults import AnyPumpFault, PumpFault
-from plant_server.sensors.effects import AnyEffect
+from plant_server.sensors.effects import AnyEffect, Effect
 
-AnyFault = Annotated[Drop | AnyPumpFault | AnyEffect, Field(discriminator="kind")]
+AnyFault = Annotated[WireFaults | AnyPumpFault | AnyEffect, Field(discriminator="kind")]
+"""A fault in a file."""
+
+Fault = WireFault | PumpFault | Effect
+"""Any fault of the catalogue, as a value."""
 
 
 class FaultFile(BaseModel):
@@ -25,13 +31,35 @@ class FaultFile(BaseModel):
 class Faults(NamedTuple):
     """The faults of a run by where they act."""
 
-    wire: tuple[Drop, ...] = ()
+    wire: tuple[WireFault, ...] = ()
     pump: tuple[AnyPumpFault, ...] = ()
     sensor: tuple[AnyEffect, ...] = ()
 
+    @classmethod
+    def of(cls, faults: Iterable[Any]) -> "Faults":
+        """Sort faults by where they act.
+
+        Raises:
+            TypeError: one is none.
+        """
+        wire: list[WireFault] = []
+        pump: list[Any] = []
+        sensor: list[Any] = []
+        for fault in faults:
+            match fault:
+                case WireFault():
+                    wire.append(fault)
+                case PumpFault():
+                    pump.append(fault)
+                case Effect():
+                    sensor.append(fault)
+                case _:
+                    raise TypeError(f"{fault!r} is no fault; see pumpbench.faults")
+        return cls(tuple(wire), tuple(pump), tuple(sensor))
+
     def as_json(self) -> list[dict[str, Any]]:
         """All of them as a fault file has them, for run.json."""
-        return [fault.model_dump(mode="json") for part in self for fault in part]
+        return [fault.model_dump(mode="json", exclude_none=True) for part in self for fault in part]
 
 
 def load(path: Path) -> Faults:
@@ -40,15 +68,23 @@ def load(path: Path) -> Faults:
     Raises:
         yaml_file.FileError: with file, line and what was expected.
     """
-    faults = yaml_file.load(path, FaultFile).faults
-    return Faults(
-        wire=tuple(fault for fault in faults if isinstance(fault, Drop)),
-        pump=tuple(fault for fault in faults if isinstance(fault, PumpFault)),
-        sensor=tuple(fault for fault in faults if not isinstance(fault, Drop | PumpFault)),
-    )
+    return Faults.of(yaml_file.load(path, FaultFile).faults)
+
+
+def dump(faults: Iterable[Any]) -> str:
+    """The text of a fault file with these; only what is not at its default, one fault a line."""
+    lines = [
+        yaml.safe_dump(
+            {"kind": fault.kind} | fault.model_dump(mode="json", exclude_defaults=True),
+            default_flow_style=True,
+            sort_keys=False,
+            width=1000,
+        ).strip()
+        for fault in faults
+    ]
+    return "faults:\n" + "".join(f"  - {line}\n" for line in lines) if lines else "faults: []\n"
 
 
 def write_wire(faults: Faults, path: Path) -> None:
     """Write the wire's part as a fault file of its own, for the gateway."""
-    entries = [fault.model_dump(mode="json", exclude_none=True) for fault in faults.wire]
-    path.write_text(yaml.safe_dump({"faults": entries}), encoding="utf-8")
+    path.write_text(dump(faults.wire), encoding="utf-8")

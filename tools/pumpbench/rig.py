@@ -6,6 +6,7 @@ bus and the plant's. `inproc`: the same nodes in this process, the same frames, 
 """
 
 import contextlib
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -16,23 +17,25 @@ import re
 import select
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 import dbc
+from can_bus.faults import MemoryState, NodeFault
 from can_bus.frame import Frame
-from can_bus.gateway import Gateway
+from can_bus.gateway import Gateway, Side
 from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.lockstep import STEPS_PER_DAY, Node
+from can_bus.node_control import attend
 from can_bus.url import open_link
 from plant_server.physiology import SOURCES, Patient, load_patient
 from plant_server.scenario import load_scenario
@@ -46,6 +49,7 @@ from pumpbench.capture import Capture
 from pumpbench.controller_model import ControllerModel, ControllerModelError, read_models, shipped_models
 from pumpbench.faults import Faults, write_wire
 from pumpbench.faults import load as load_fault_file
+from pumpbench.node import InProcess, Process
 from pumpbench.recorder import write
 from pumpbench.runfolder import RunFolder
 
@@ -226,11 +230,18 @@ def execute(prepared: Prepared) -> Path:
 
 
 class Wires:
-    """The buses of a run in one process: hands every frame to every other node, in order."""
+    """The buses of a run in one process: hands every frame to every other node, in order.
 
-    def __init__(self, plant: PlantServer, firmware: Node, gateway: Gateway | None, capture: Capture) -> None:
+    Args:
+        plant: a fresh one.
+        device: a node, or a firmware with its power switch.
+        gateway: between the two, with the device behind it.
+        capture: gets every frame.
+    """
+
+    def __init__(self, plant: PlantServer, device: Node | InProcess, gateway: Gateway | None, capture: Capture) -> None:
         self.plant = plant
-        self.firmware = firmware
+        self.device = device
         self.gateway = gateway
         self.capture = capture
 
@@ -240,39 +251,72 @@ class Wires:
         Raises:
             NodeDied: the firmware did not answer a token; in one process it never will.
         """
-        to_device = deque(self.plant.call_roll())
-        while to_device:
-            to_plant = self._deliver(to_device, self.firmware, from_plant=True)
-            to_device = self._deliver(to_plant, self.plant, from_plant=False)
+        from_plant: list[Frame] = self.plant.call_roll()
+        while from_plant:
+            from_plant = self._round(from_plant)
             if self.plant.step % 16 == 0:
                 progress(self.plant.step)
         if not self.plant.finished:
             raise NodeDied(f"the firmware went silent: {self.plant.waiting_for}")
 
-    def _deliver(self, frames: deque[Frame], node: Node, *, from_plant: bool) -> deque[Frame]:
-        sent = list(frames)
+    def _round(self, from_plant: list[Frame]) -> list[Frame]:
+        """What the plant sends after this, once everybody who is spoken to has answered."""
         if self.gateway is None:
-            self.capture.extend(0, sent)
-            arriving = sent
-        else:
-            self.capture.extend(1 if from_plant else 0, sent)
-            arriving = [passed for frame in sent for passed in self.gateway.forward(frame)]
-            self.capture.extend(0 if from_plant else 1, arriving)
-        answers: deque[Frame] = deque()
-        for frame in arriving:
-            answers.extend(node.receive(frame))
-        return answers
+            self.capture.extend(0, from_plant)
+            said = self._tell_device(from_plant)
+            self.capture.extend(0, said)
+            return self._tell_plant(said)
+        self.capture.extend(1, from_plant)
+        answers: list[Frame] = []
+        to_plant: list[Frame] = []
+        for frame in from_plant:  # one by one: a fault may replace the device between two of them
+            crossing = self.gateway.forward(frame, Side.PLANT)
+            self.capture.extend(0, crossing.device)
+            to_plant += crossing.plant
+            answers += self._tell_device(crossing.device)
+        while answers:
+            self.capture.extend(0, answers)
+            for frame in answers:
+                to_plant += self.gateway.forward(frame, Side.DEVICE).plant
+            answers = self._started()
+        self.capture.extend(1, to_plant)
+        return self._tell_plant(to_plant)
+
+    def _tell_device(self, frames: Sequence[Frame]) -> list[Frame]:
+        node = self.device.firmware if isinstance(self.device, InProcess) else self.device
+        return [answer for frame in frames for answer in node.receive(frame)] + self._started()
+
+    def _started(self) -> list[Frame]:
+        """What a device says that a fault has just started."""
+        if not isinstance(self.device, InProcess):
+            return []
+        said, self.device.said = self.device.said, []
+        return said
+
+    def _tell_plant(self, frames: Sequence[Frame]) -> list[Frame]:
+        return [answer for frame in frames for answer in self.plant.receive(frame)]
 
 
 def _in_process(prepared: Prepared, folder: RunFolder) -> Path:
-    from firmware_sim.firmware import Firmware  # noqa: PLC0415
-
     request = prepared.request
     capture = Capture()
-    gateway = Gateway(prepared.faults.wire) if prepared.faults.wire else None
-    Wires(PlantServer(prepared.run), Firmware(), gateway, capture).run(request.progress)
+    simulate(prepared, capture)
     write(folder, capture, prepared.info, complete=True)
     return request.out
+
+
+def simulate(prepared: Prepared, capture: Capture) -> None:
+    """Do the run in this process, with the built-in firmware; `capture` gets every frame and nothing is written.
+
+    Raises:
+        NodeDied, PlantError: the run did not come to its end.
+    """
+    from firmware_sim.firmware import Firmware  # noqa: PLC0415
+
+    wire = prepared.faults.wire
+    device: Node | InProcess = InProcess() if any(isinstance(fault, NodeFault) for fault in wire) else Firmware()
+    gateway = Gateway(wire, device if isinstance(device, InProcess) else None) if wire else None
+    Wires(PlantServer(prepared.run), device, gateway, capture).run(prepared.request.progress)
 
 
 # ---- processes on a bus
@@ -281,7 +325,15 @@ def _in_process(prepared: Prepared, folder: RunFolder) -> Path:
 class Child:
     """A process of the run: ends with it, and its last words are kept."""
 
-    def __init__(self, name: str, command: list[str], environment: dict[str, str], log: IO[bytes], ready: bool) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: list[str],
+        environment: dict[str, str],
+        log: IO[bytes],
+        ready: bool,
+        keep: Sequence[int] = (),
+    ) -> None:
         self.name = name
         self._log = log
         try:
@@ -292,6 +344,7 @@ class Child:
                 stderr=log,
                 env=environment,
                 start_new_session=True,
+                pass_fds=keep,
             )
         except OSError as error:
             raise NodeDied(f"cannot start the {name} ({shlex.join(command)}): {error.strerror}") from error
@@ -307,6 +360,12 @@ class Child:
                     return
                 raise self.died()
         raise NodeDied(f"the {self.name} was not ready within {seconds:g} s{self._last_words()}")
+
+    def kill(self) -> None:
+        """SIGKILL, to the process and to everything it started."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
 
     def check(self) -> None:
         """Raise if the process has ended."""
@@ -333,6 +392,7 @@ class Child:
         for number in (signal.SIGTERM, signal.SIGKILL):
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, number)
+                os.killpg(self.process.pid, signal.SIGCONT)  # one that a fault has stopped would not end
             if self.finish(2.0) is not None and number == signal.SIGTERM:
                 # the leader has gone; whoever it started is in its session
                 with contextlib.suppress(ProcessLookupError):
@@ -407,10 +467,10 @@ def _processes(prepared: Prepared) -> Path:
                 device_url = request.device_bus or _second_bus(plant_url)
             link = stack.enter_context(open_link(plant_url))
 
-        def start(name: str, command: list[str], *, ready: bool) -> Child:
-            log = stack.enter_context((place / f"{name}.log").open("wb"))
+        def start(name: str, command: list[str], *, ready: bool, keep: Sequence[int] = ()) -> Child:
+            log = stack.enter_context((place / f"{name}.log").open("ab"))
             environment = os.environ | {"PUMPBENCH_BUS": device_url, "PYTHONUNBUFFERED": "1"}
-            child = Child(name, command, environment, log, ready)
+            child = Child(name, command, environment, log, ready, keep)
             children.append(child)
             if name == "recorder" and other_cpus:
                 os.sched_setaffinity(child.process.pid, other_cpus)
@@ -422,12 +482,25 @@ def _processes(prepared: Prepared) -> Path:
             if hub is not None:
                 hub.poll(0)
 
-        recorder = _start_recorder_side(prepared, place, plant_url, device_url, start, hosted=hub is not None)
-        start("firmware", _firmware_command(request, device_url), ready=False)
+        switch, ours = _switch(prepared, stack)
+        recorder = _start_recorder_side(
+            prepared, place, plant_url, device_url, start, hosted=hub is not None, switch=switch
+        )
+
+        nvm = place / "nvm"
+
+        def launch(memory: MemoryState) -> Child:
+            return start("firmware", _firmware_command(request, device_url, nvm if ours else None, memory), ready=False)
+
+        firmware = Process(launch, nvm)
+        if ours is not None:
+            threading.Thread(target=attend, args=(ours, firmware), daemon=True).start()
 
         def watch() -> None:
-            for child in children:
-                child.check()
+            firmware.check()
+            for child in list(children):
+                if child.name != "firmware":
+                    child.check()
 
         try:
             serve(
@@ -445,8 +518,24 @@ def _processes(prepared: Prepared) -> Path:
     return request.out
 
 
+def _switch(prepared: Prepared, stack: contextlib.ExitStack) -> tuple[socket.socket | None, socket.socket | None]:
+    """A pair of sockets for faults of the node: the gateway asks at the first, we answer at the second."""
+    if not any(isinstance(fault, NodeFault) for fault in prepared.faults.wire):
+        return None, None
+    asking, ours = socket.socketpair()
+    stack.callback(ours.close)
+    return asking, ours
+
+
 def _start_recorder_side(
-    prepared: Prepared, place: Path, plant_url: str, device_url: str, start: Callable[..., Child], *, hosted: bool
+    prepared: Prepared,
+    place: Path,
+    plant_url: str,
+    device_url: str,
+    start: Callable[..., Child],
+    *,
+    hosted: bool,
+    switch: socket.socket | None,
 ) -> Child:
     """Start the gateway, if there are faults, and the recorder."""
     request = prepared.request
@@ -455,7 +544,12 @@ def _start_recorder_side(
         write_wire(prepared.faults, wire)
         command = [sys.executable, "-m", "can_bus.gateway", "--plant", plant_url, "--device", device_url]
         command += ["--faults", str(wire)]
-        start("gateway", [*command, "--host"] if hosted else command, ready=True)
+        command += ["--host"] if hosted else []
+        if switch is None:
+            start("gateway", command, ready=True)
+        else:
+            with switch:  # the gateway has its own copy
+                start("gateway", [*command, "--node-socket", str(switch.fileno())], ready=True, keep=[switch.fileno()])
     info = place / "info.json"
     info.write_text(json.dumps(prepared.info), encoding="utf-8")
     command = [sys.executable, "-m", "pumpbench.recorder", "--bus", device_url, "--out", str(request.out)]
@@ -465,10 +559,17 @@ def _start_recorder_side(
     return start("recorder", command, ready=True)
 
 
-def _firmware_command(request: Request, device_url: str) -> list[str]:
+def _firmware_command(request: Request, device_url: str, nvm: Path | None, memory: MemoryState) -> list[str]:
     if request.firmware is None:
-        return [sys.executable, "-m", "firmware_sim", "--bus", device_url]
-    command = [part.replace("{bus}", device_url) for part in shlex.split(request.firmware)]
+        command = [sys.executable, "-m", "firmware_sim", "--bus", device_url]
+        if nvm is not None:
+            command += ["--nvm", str(nvm), "--reset-cause", "power_on" if memory == "kept" else "brown_out"]
+        return command
+    places = {"{bus}": device_url, "{nvm}": str(nvm or "")}
+    command = [
+        functools.reduce(lambda text, place: text.replace(*place), places.items(), part)
+        for part in shlex.split(request.firmware)
+    ]
     if not command:
         raise RigError("--firmware is empty; give the command that starts it, {bus} stands for the bus URL")
     return command

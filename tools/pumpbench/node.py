@@ -1,0 +1,135 @@
+"""The device's power switch: what a fault of the node does to the firmware of a run (`can_bus.faults.NodeControl`)."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from can_bus.faults import MemoryState
+from can_bus.frame import Frame
+from firmware_sim.nvm import ERASED, FileMemory, Memory, RamMemory, bank_size, memory_size
+
+if TYPE_CHECKING:
+    from pumpbench.rig import Child
+
+
+def tear(memory: Memory, words: int) -> None:
+    """Leave the newest record of the reference firmware's memory half written, as a power cut would.
+
+    Args:
+        memory: two banks for records of at most so many `words` (`firmware_sim.nvm`); nothing happens to a blank one.
+    """
+    size = bank_size(words)
+    generations = [int.from_bytes(memory.read(bank * size + 8, 4), "little") for bank in range(2)]
+    written = [memory.read(bank * size, 4) != bytes([ERASED]) * 4 for bank in range(2)]
+    if not any(written):
+        return
+    first_is_newer = (generations[0] - generations[1]) % (1 << 32) < 1 << 31
+    newest = 0 if written[0] and (not written[1] or first_is_newer) else 1
+    half = size // 4
+    memory.write(newest * size + half, bytes([ERASED]) * (size - half))
+
+
+class InProcess:
+    """The reference firmware in this process, with a memory that outlives it."""
+
+    def __init__(self) -> None:
+        from firmware_sim.firmware import NVM_WORDS, Firmware  # noqa: PLC0415
+
+        self._words = NVM_WORDS
+        self._memory = RamMemory(memory_size(NVM_WORDS))
+        self.firmware: Firmware = Firmware(self._memory)
+        self.said: list[Frame] = []  # by a firmware that has just started
+
+    def cut(self) -> None:
+        """The gateway lets nothing in or out any more; what is in RAM is forgotten at the start."""
+
+    def start(self, memory: MemoryState) -> None:
+        """A new life."""
+        from firmware_sim.firmware import Cause, Firmware  # noqa: PLC0415
+
+        if memory == "torn":
+            tear(self._memory, self._words)
+        elif memory == "lost":
+            self._memory.write(0, bytes([ERASED]) * self._memory.size)
+        self.firmware = Firmware(self._memory, Cause.POWER_ON if memory == "kept" else Cause.BROWN_OUT)
+        self.said += self.firmware.start()
+
+    def freeze(self) -> None:
+        """Nobody calls it."""
+
+    def thaw(self) -> None:
+        """It is called again."""
+
+
+class Process:
+    """A firmware in a process of its own.
+
+    Args:
+        launch: starts it and returns the child.
+        nvm: the file of its memory.
+
+    Attributes:
+        lock: held while the process is being replaced.
+        expected_dead: it has no power, so that its end is no accident.
+    """
+
+    def __init__(self, launch: Callable[[MemoryState], "Child"], nvm: Path) -> None:
+        self._launch = launch
+        self._nvm = nvm
+        self.lock = threading.Lock()
+        self.expected_dead = False
+        self.child = launch("kept")
+
+    def check(self) -> None:
+        """Raise if it has ended without being asked to.
+
+        Raises:
+            NodeDied: it has.
+        """
+        with self.lock:
+            if not self.expected_dead:
+                self.child.check()
+
+    def cut(self) -> None:
+        """SIGKILL, to it and to whatever it started."""
+        with self.lock:
+            self.expected_dead = True
+            self.child.kill()
+
+    def start(self, memory: MemoryState) -> None:
+        """Start the same command again.
+
+        Raises:
+            NodeDied: it cannot be started.
+            ValueError: its memory is not one of the reference firmware, so that nobody knows how to tear it.
+        """
+        with self.lock:
+            if memory == "lost":
+                self._nvm.unlink(missing_ok=True)
+            elif memory == "torn" and self._nvm.exists():
+                self._tear()
+            self.child = self._launch(memory)
+            self.expected_dead = False
+
+    def _tear(self) -> None:
+        from firmware_sim.firmware import NVM_WORDS  # noqa: PLC0415
+
+        size = self._nvm.stat().st_size
+        if size != memory_size(NVM_WORDS):
+            raise ValueError(
+                f"{self._nvm}: a torn memory needs the layout of the reference firmware, {memory_size(NVM_WORDS)} bytes"
+            )
+        memory = FileMemory(str(self._nvm), size)
+        tear(memory, NVM_WORDS)
+        memory.close()
+
+    def freeze(self) -> None:
+        """SIGSTOP."""
+        os.killpg(self.child.process.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """SIGCONT."""
+        os.killpg(self.child.process.pid, signal.SIGCONT)
