@@ -42,7 +42,6 @@ def serve(
         PlantError: the device broke the protocol.
         BusLost: the bus is gone or lost frames.
     """
-    PlantServer(plant.run).rehearse()  # while nobody waits: a hub in this process stands still meanwhile
     calling = True
     link.send(plant.call_roll())
     heard = called = time.monotonic()  # others may talk on the bus all the time: only what is answered counts

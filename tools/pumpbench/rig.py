@@ -153,7 +153,7 @@ def prepare(request: Request) -> Prepared:
     mode = MODES[request.strategy]
     sensor = sensor.model_copy(update={"effects": (*sensor.effects, *faults.sensor)})
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, faults.pump)
-    PlantServer(run)  # checks the rest
+    PlantServer(run).rehearse()  # checks the rest, and loads compiled code before anybody waits on a bus
     info = {
         "pumpbench": __version__,
         "protocol": ".".join(map(str, dbc.protocol_version())),
