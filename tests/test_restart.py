@@ -15,8 +15,9 @@ DEADLINE = 60.0
 
 
 def wait_for(path: Path, *, filled: bool = False) -> None:
+    """Until a file is there; a memory that is `filled` holds a record, so that its device is in the midst of a run."""
     end = time.monotonic() + DEADLINE
-    while not path.exists() or (filled and not path.stat().st_size):
+    while not path.exists() or (filled and not path.read_bytes().strip(b"\xff")):
         assert time.monotonic() < end, f"{path} did not appear"
         time.sleep(0.02)
 
