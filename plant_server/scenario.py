@@ -62,7 +62,10 @@ DAYS_MAX = 3650
 GENERATED_DAYS = 14
 """Length of a generated scenario when nobody says how long."""
 
-BUILT_IN = ("fasting", "validation-14d", "tuning", "camerlingo")
+BUILT_IN = ("fasting", "six-hours", "validation-14d", "tuning", "camerlingo")
+
+SIX_HOURS = ((60, "Breakfast", 50.0), (180, "Snack", 20.0), (270, "Lunch", 60.0))
+"""Minute of the day, type, g: three meals before 06:00, told exactly and in time, for tests of a few hours."""
 
 COLUMNS = ("day", "type", "time", "cho_g")
 """Of a CSV file; `carbs` is another name for the last."""
@@ -157,6 +160,10 @@ def load_scenario(name: str, *, seed: int = 1, patient: str = "", days: float | 
 def _built_in(name: str, seed: int, patient: str, days: float | None) -> Scenario:
     if name == "fasting":
         return Scenario("fasting", DAYS_MAX, ())
+    if name == "six-hours":
+        length = 1 if days is None else max(math.ceil(days), 1)
+        meals = [(day * MINUTES_PER_DAY + minute, kind, carbs) for day in range(length) for minute, kind, carbs in SIX_HOURS]
+        return Scenario("six-hours", length, planned(meals, length))
     if name == "tuning":
         return tuning(seed, patient)
     if name == "camerlingo":

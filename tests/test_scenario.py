@@ -411,7 +411,7 @@ WRONG_YAML = {
     "meals:\n  - {day: 1, time: '23:00', type: Snack, carbs: -5}": "2: meals.0.carbs",
     "meals:\n  - {day: 1, time: '23:00', type: Snack, grams: 5}": "unknown key",
     "days: 3": "give the meals, or based_on",
-    "based_on: breakfast": "based_on is one of fasting, validation-14d, tuning, camerlingo, found 'breakfast'",
+    "based_on: breakfast": "based_on is one of fasting, six-hours, validation-14d, tuning, camerlingo, found 'breakfast'",
     "based_on: validation-14d\ndays: 15": "days: scenario validation-14d has 14 days, asked for 15",
     "meals: []\nrescue: {below: 5}": "2: rescue.below",
     "meals: []\nannouncements: {missed: 1.5}": "2: announcements.missed",
@@ -459,7 +459,7 @@ def check_error(file: Path, text: str) -> None:
     [
         (
             "breakfast",
-            "there is no scenario 'breakfast'; choose one of fasting, validation-14d, tuning, camer",
+            "there is no scenario 'breakfast'; choose one of fasting, six-hours, validation-14d, tuning, camer",
         ),
         ("validation", "did you mean validation-14d"),
         ("no.csv", "cannot read the scenario no.csv"),
@@ -477,7 +477,7 @@ def test_a_generator_has_an_end_too() -> None:
 
 
 def test_what_is_built_in_can_be_loaded() -> None:
-    assert built_in() == ("fasting", "validation-14d", "tuning", "camerlingo")
+    assert built_in() == ("fasting", "six-hours", "validation-14d", "tuning", "camerlingo")
     for name in built_in():
         scenario = load_scenario(name)
         assert scenario.name == name

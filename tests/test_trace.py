@@ -178,7 +178,7 @@ def test_fault_spans_from_counts_and_clears() -> None:
     spans = Trace({}, steps, steps * 300.0, faults=events).fault_spans()
     assert spans == [
         FaultSpan("Stuck CGM_Reading", 600.0, 1500.0),
-        FaultSpan("Drop PUMP", 900.0, 1800.0),
+        FaultSpan("Drop PUMP", 900.0, 1200.0),
         FaultSpan("Delay PUMP_BasalCmd", 28800.0, 30000.0),
     ]
 

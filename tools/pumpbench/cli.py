@@ -28,7 +28,7 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 PATIENTS = "A name, a comma list, or all; file.csv#name or file.csv for patients of your own, with --controller."
-SCENARIOS = "validation-14d, tuning, camerlingo, fasting, or a YAML or CSV file."
+SCENARIOS = "validation-14d, tuning, camerlingo, fasting, six-hours, or a YAML or CSV file."
 SENSORS = "coloured, ideal, breton, facchinetti, dexcom-g5, dexcom-g6, vettoretti, or a YAML file."
 PHYSIOLOGIES = "Equations: S2008, or S2013 with counter-regulation (default: what the patient's file says)."
 PRAMLINTIDE = "Parameter set: P2, P4, moderate, conservative or strong; +type1 behind it for a lower bioavailability."

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic.fields import FieldInfo
 
 from can_bus import yaml_file
 from can_bus.faults import Fault as WireFault
@@ -88,3 +89,53 @@ def dump(faults: Iterable[Any]) -> str:
 def write_wire(faults: Faults, path: Path) -> None:
     """Write the wire's part as a fault file of its own, for the gateway."""
     path.write_text(dump(faults.wire), encoding="utf-8")
+
+
+class Maker:
+    """Makes faults of one kind: `drop("CGM_Reading", start="02:00", end="02:40")`.
+
+    What may stand without its name: the keys that the kind needs, in their order, then its own others.
+    """
+
+    def __init__(self, kind: type[BaseModel]) -> None:
+        self.of = kind
+        needed = [name for name, key in kind.model_fields.items() if key.is_required()]
+        own = [name for name in vars(kind).get("__annotations__", {}) if name in kind.model_fields]
+        self._positional = [name for name in dict.fromkeys(needed + own) if name not in ("kind", "start", "end")]
+        self.__doc__ = kind.__doc__
+
+    def __call__(self, *values: Any, **keys: Any) -> Any:
+        """A fault.
+
+        Raises:
+            TypeError: too many values, or a key twice.
+            pydantic.ValidationError: a value that does not fit; the text says what was expected.
+        """
+        names = self._positional[: len(values)]
+        if len(names) < len(values) or set(names) & set(keys):
+            raise TypeError(f"{kind_of(self.of)}: takes {', '.join(self._positional)} in this order, or by name")
+        return self.of(**dict(zip(names, values, strict=True)), **keys)
+
+
+def kind_of(fault: type[BaseModel]) -> str:
+    """The kind's name in a fault file."""
+    name: str = fault.model_fields["kind"].default
+    return name
+
+
+def _members(union: Any) -> list[type[Any]]:
+    parts = [_members(part) for part in get_args(union) if not isinstance(part, FieldInfo)]
+    return [member for part in parts for member in part] or [union]
+
+
+KINDS: dict[str, type[Any]] = {kind_of(fault): fault for fault in _members(AnyFault)}
+"""Every kind of fault by its name."""
+
+__all__ = ["KINDS", "AnyFault", "Fault", "FaultFile", "Faults", "Maker", "dump", "kind_of", "load", "write_wire", *KINDS]
+
+
+def __getattr__(name: str) -> Maker:
+    """The maker of each kind: `pumpbench.faults.drop` and so on."""
+    if name in KINDS:
+        return Maker(KINDS[name])
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

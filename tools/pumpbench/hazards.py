@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from can_bus import codec
 from can_bus.codec import Check, Receiver
 from can_bus.frame import Frame
 from can_bus.lockstep import Done, Phase
@@ -67,6 +68,31 @@ GRACE = 1
 """Steps a device may take to raise an alarm (requirement ALM-03)."""
 
 
+FIRST_HAZARDS = 20
+"""So many are told with their step."""
+
+MEMORY_LOST = codec.choice("FAULT_Inject", "FaultKind", "NodeMemoryLost")
+
+
+class Hazards(dict[str, int]):
+    """Counts by name.
+
+    Attributes:
+        step: sampling instant now.
+        found: the instant and the name of every one, in order.
+    """
+
+    def __init__(self) -> None:
+        super().__init__({f"H{number}": 0 for number in range(1, 9)})
+        self.step = -1
+        self.found: list[tuple[int, str]] = []
+
+    def __setitem__(self, name: str, count: int) -> None:
+        """Set a count; what it grows by is found now."""
+        self.found += [(self.step, name)] * (count - self[name])
+        super().__setitem__(name, count)
+
+
 @dataclass
 class _Bolus:
     """One BolusId of one drug, as the bus has shown it so far."""
@@ -86,7 +112,7 @@ class _Bolus:
 class _BolusWatch:
     """Boluses of both drugs: H1, H5, and the part of H2 that is about them."""
 
-    def __init__(self, hazards: dict[str, int]) -> None:
+    def __init__(self, hazards: Hazards) -> None:
         self._hazards = hazards
         self.limits = {1: 0, 2: 0}
         self._known: dict[tuple[int, int], _Bolus] = {}  # (drug, BolusId)
@@ -174,7 +200,7 @@ class _BolusWatch:
 class _ResetWatch:
     """H8: what the device said of itself before a reset against what it says after it."""
 
-    def __init__(self, hazards: dict[str, int]) -> None:
+    def __init__(self, hazards: Hazards) -> None:
         self._hazards = hazards
         self._before: dict[str, int] | None = None  # the newest status
         self._step = -1  # of that status
@@ -191,6 +217,10 @@ class _ResetWatch:
         """The device has started anew in the middle of a run."""
         self._booted = True
         self._told = None  # heard and forgotten
+
+    def forget(self) -> None:
+        """The device has come back with a blank memory: there is nothing it could know."""
+        self._booted = False
 
     def mode(self) -> None:
         """A mode was asked for."""
@@ -235,7 +265,7 @@ class Monitor:
         self._start()
 
     def _start(self) -> None:
-        self.hazards = dict.fromkeys(("H1", "H2", "H3", "H4", "H5", "H6", "H7", "H8"), 0)
+        self.hazards = Hazards()
         self._resets = _ResetWatch(self.hazards)
         self._boluses = _BolusWatch(self.hazards)
         self._step = -1  # of the newest token
@@ -254,7 +284,6 @@ class Monitor:
         self._phase: int = Phase.INIT
         self.limiter_steps = 0
         self.diag: dict[str, int] | None = None
-        self.injected = 0
 
     def watch(self, frames: Iterable[Frame]) -> None:
         """Take frames of the device's bus in order."""
@@ -268,7 +297,7 @@ class Monitor:
     def _on_sync_step(self, values: dict[str, int]) -> None:
         self._phase = values["SyncPhase"]
         if self._phase in (Phase.STEP, Phase.CONTINUE):
-            self._step = values["StepIndex"]
+            self._step = self.hazards.step = values["StepIndex"]
 
     def _on_cgm_reading(self, values: dict[str, int]) -> None:
         state, glucose = values["CgmState"], values["GlucoseConc"]
@@ -316,8 +345,9 @@ class Monitor:
         if total % stroke or before != self._ledger_base.setdefault(drug, before):
             self.hazards["H6"] += 1
 
-    def _on_fault_inject(self, _values: dict[str, int]) -> None:
-        self.injected += 1
+    def _on_fault_inject(self, values: dict[str, int]) -> None:
+        if values["FaultKind"] == MEMORY_LOST:
+            self._resets.forget()
 
     # ---- what it did
 
@@ -393,14 +423,14 @@ class Monitor:
 
     def safety(self, ledger: dict[str, Any]) -> dict[str, Any]:
         """The `safety` part of metrics.json; counts are the device's own where it reports them."""
-        hazards = {f"H{number}": self.hazards.get(f"H{number}") for number in range(1, 9)}
+        hazards = dict(self.hazards)
         return {
             "frames_lost": None if self.diag is None else self.diag["LostFrameCount"],
             "e2e_errors": None if self.diag is None else self.diag["E2eErrorCount"],
             "sequence_errors": None if self.diag is None else self.diag["SequenceErrorCount"],
             "saturations": None if self.diag is None else self.diag["SaturationCount"],
             "limiter_steps": self.limiter_steps,
-            "faults_injected": self.injected,
             "ledger": ledger,
             "hazards": hazards,
+            "first_hazards": [{"step": step, "hazard": name} for step, name in self.hazards.found[:FIRST_HAZARDS]],
         }

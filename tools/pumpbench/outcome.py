@@ -58,5 +58,8 @@ def measure(trace: "Trace", frames: "Frames") -> dict[str, Any]:
         "insulin": _ledger(trace, "Insulin", "InsulinTotal", INSULIN_STROKE_U),
         "pramlintide": _ledger(trace, "Pram", "PramTotal", PRAMLINTIDE_STROKE_UG),
     }
-    safety = monitor.safety(ledger) | {"alarms": len({(event.node, event.instance) for event in trace.alarms})}
+    safety = monitor.safety(ledger) | {
+        "faults_injected": len(trace.faults),
+        "alarms": len({(event.node, event.instance) for event in trace.alarms}),
+    }
     return outcome | {"safety": safety}

@@ -80,7 +80,7 @@ class Request:
     seed: int = 1
     bus: str = "hub"
     device_bus: str | None = None
-    faults: Path | None = None
+    faults: Path | Faults | None = None
     firmware: str | None = None
     sensor: str = "coloured"
     physiology: str | None = None  # None: what the patient's file says
@@ -145,7 +145,7 @@ def prepare(request: Request) -> Prepared:
         raise RigError(
             f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
         )
-    faults = load_fault_file(request.faults) if request.faults else Faults()
+    faults = load_fault_file(request.faults) if isinstance(request.faults, Path) else request.faults or Faults()
     model = request.model or controller_model(request.patient, patient, request.controller)
     sensor = load_sensor(request.sensor)
     tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))

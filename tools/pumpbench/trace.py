@@ -310,8 +310,8 @@ class Trace:
     def fault_spans(self) -> list[FaultSpan]:
         """When which fault was at work, as far as FAULT_Inject tells.
 
-        A count of n frames is drawn as n steps, a count of 0 lasts until the target's fault is cleared (kind None) or
-        the run ends. Announcements of the same fault that touch each other are one span.
+        A report is drawn as the step it was made in; a count of 0 lasts until the target's fault is cleared (kind None)
+        or the run ends. Announcements of the same fault that touch each other are one span.
         """
         end_of_run = float(self.time_s[-1]) if len(self) else 0.0
         spans: list[FaultSpan] = []
@@ -319,7 +319,7 @@ class Trace:
             if event.kind == "None":
                 continue
             start = STEP_SECONDS * (event.time_s // STEP_SECONDS)
-            end = start + STEP_SECONDS * event.count
+            end = start + STEP_SECONDS
             if event.count == 0:
                 clears = (
                     later.time_s
