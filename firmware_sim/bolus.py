@@ -86,6 +86,7 @@ class Boluses:
     def __init__(self) -> None:
         self.next_id = 0
         self.refused = 0  # boluses the pump refused or understood wrongly, so far
+        self.unanswered = 0  # commands that no acknowledgement came for, so far
         self.limit = {Drug.INSULIN: 4000, Drug.PRAMLINTIDE: 4000}  # what the pump accepts, as it last said
         self._open: dict[Drug, _Bolus] = {}
         self._states: dict[Drug, dict[str, int]] = {}
@@ -230,6 +231,7 @@ class Boluses:
             if bolus.op == Op.NONE:
                 continue
             if ack is None:
+                self.unanswered += 1
                 if bolus.sends >= SENDS:
                     bolus.uncertain = bolus.uncertain or bolus.op != Op.CANCEL or bolus.committed
                     bolus.op = Op.NONE

@@ -45,6 +45,7 @@ class Verdict:
     glucose: int = -1  # 0.1 mg/dL, -1 = nothing usable
     refused: int = 0  # samples refused for what they say or when they were taken
     repeated: int = 0  # samples refused as not newer than the last one
+    late: int = 0  # samples used that were taken at an earlier instant
     missing: int = 0  # sample numbers skipped whose frames never came
 
 
@@ -126,6 +127,7 @@ class Cgm:
                 verdict.refused += 1
                 self._unused += 1
                 continue
+            verdict.late += age > 0
             verdict.missing += max(ahead - 1 - self._unused, 0)
             self._glucose_last = glucose
             self._unconfirmed = -1

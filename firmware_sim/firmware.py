@@ -174,6 +174,7 @@ class Firmware:
         self._samples: list[dict[str, int]] = []
         self._totals: dict[str, int] | None = None
         self._status: dict[str, int] | None = None
+        self._bolus_states: set[int] = set()  # drugs heard of in this step
         self._rejected = False
         self._scheduler = Scheduler(self._tasks())
         self._frames_heard = 0
@@ -196,6 +197,7 @@ class Firmware:
         self._sequence_errors = 0
         self._reported_state = State.INIT
         self._last_e2e_error = -STEP_SNA
+        self._bus_errors = 0  # error frames of the controller
         self._impostors = 0  # frames with an id of ours that we did not send
         self._impostors_seen = 0
         self._last_impostor = -STEP_SNA
@@ -220,6 +222,7 @@ class Firmware:
         check, name, values, _ = self._receiver.receive(frame)
         if check == Check.UNKNOWN and frame.can_id in self._own_ids:
             self._impostors += 1  # a node never hears itself
+        self._bus_errors += frame.is_error
         self._frames_heard += check != Check.UNKNOWN
         if check > Check.OK_SOME_LOST:
             if check in (Check.REPEATED, Check.WRONG_SEQUENCE) and name == "CGM_Reading":
@@ -247,11 +250,14 @@ class Firmware:
         self._status = values
 
     def _on_pump_ack(self, values: dict[str, int]) -> None:
+        misunderstood = self._pump.misunderstood
         self._pump.hear_ack(values)
+        self._impostors += self._pump.misunderstood > misunderstood  # somebody else told the pump
         self._boluses.hear_ack(values)
 
     def _on_bolus_state(self, values: dict[str, int]) -> None:
         self._boluses.hear_state(values)
+        self._bolus_states.add(values["BolusStateHormone"])
 
     def _on_cgm_status(self, values: dict[str, int]) -> None:
         self._cgm.status(values)
@@ -461,7 +467,7 @@ class Firmware:
             lost = self._receiver.lost_of("CGM_Reading")
             self._lost_unseen += max(verdict.missing - (lost - self._lost_samples_seen), 0)
             self._lost_samples_seen = lost
-        self._sequence_errors += verdict.repeated
+        self._sequence_errors += verdict.repeated + verdict.late
         if verdict.refused or verdict.repeated:
             self._last_implausible = step
         if verdict.glucose >= 0:
@@ -473,6 +479,9 @@ class Firmware:
         """Insulin (mU) delivered since the last step, -1 when not known; and the part of it that was a bolus."""
         if self._status is not None:
             self._pump.status(self._status, step)
+        for drug in self._bolus_states:
+            self._pump.bolus_state(drug, step)
+        self._bolus_states.clear()
         pramlintide = self._pump.pramlintide(self._totals)
         basal = self._calibration.parameters[layout.BASAL]
         bolus = sum(raw * 10 for drug, raw in self._boluses.open_step(step) if drug == Drug.INSULIN)
@@ -616,13 +625,14 @@ class Firmware:
 
     def _all_sequence_errors(self) -> int:
         by_number = self._pump.refused + self._meals.repeated
-        return self._sequence_errors + self._receiver.sequence_errors + by_number
+        unanswered = self._pump.unanswered + self._boluses.unanswered
+        return self._sequence_errors + self._receiver.sequence_errors + by_number + unanswered
 
     def _fallbacks(self) -> int:
         return 0 if self._nvm is None else self._nvm.fallbacks
 
     def _e2e_errors(self) -> int:
-        return self._receiver.crc_errors + self._receiver.malformed + self._impostors
+        return self._receiver.crc_errors + self._receiver.malformed + self._impostors + self._bus_errors
 
     def _lost_frames(self) -> int:
         return self._receiver.lost + self._lost_unseen

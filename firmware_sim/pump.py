@@ -26,6 +26,8 @@ UNLIKE_STEPS = 2
 ACK_INSULIN_RATE, ACK_PRAM_RATE = 1, 8
 """PUMP_Ack.AckFor of the two answers to a set-point."""
 
+ACK_RATES = (ACK_INSULIN_RATE, ACK_PRAM_RATE)
+
 ACCEPTED, DUPLICATE, OVER_LIMIT = 0, 1, 3
 """PUMP_Ack.AckResult."""
 
@@ -65,11 +67,17 @@ class Pump:
         self._commanded_rate: int | None = None  # 0.005 U/h in force by our last command; None = schedule
         self._status_step = -NEVER
         self._totals_step = -NEVER
+        self._bolus_steps: dict[int, int] = {}  # drug -> step of its newest PUMP_BolusState
+        self._answers = False  # the pump is one that acknowledges set-points
+        self._awaited: set[int] = set()  # AckFor of what the last set-point has not been answered with
+        self._rates: tuple[int, int] | None = None  # raw, of the last set-point
         self.refused = 0  # totals that fell without a reset, acknowledgements that were not Accepted
+        self.unanswered = 0  # answers to set-points that never came
+        self.misunderstood = 0  # set-points that the pump took for others
 
     def age(self, step: int) -> int:
-        """Steps since both the status and the totals were last heard."""
-        return step - min(self._status_step, self._totals_step)
+        """Steps since status, totals and the states of boluses were last heard; of these, those ever heard."""
+        return step - min(self._status_step, self._totals_step, *self._bolus_steps.values())
 
     @property
     def heard(self) -> bool:
@@ -90,11 +98,20 @@ class Pump:
         self.insulin_blocked = stopped or values["InsulinOcclusion"] == OCCLUDED or values["InsulinReservoir"] == 0
         self.pram_blocked = values["PramOcclusion"] == OCCLUDED or values["PramReservoir"] == 0
 
+    def bolus_state(self, drug: int, step: int) -> None:
+        """A PUMP_BolusState arrived for instant `step`."""
+        self._bolus_steps[drug] = step
+
     def hear_ack(self, values: dict[str, int]) -> None:
         """A PUMP_Ack of the last set-point; the two drugs are judged apart (requirement TWO-05)."""
         if values["AckId"] != self._sequence:
             return
         accepted = values["AckResult"] in (ACCEPTED, DUPLICATE)
+        if values["AckFor"] in ACK_RATES:
+            self._answers = True
+            self._awaited.discard(values["AckFor"])
+            asked = None if self._rates is None else self._rates[ACK_RATES.index(values["AckFor"])]
+            self.misunderstood += accepted and asked not in (None, values["AckEchoRaw"])
         if values["AckFor"] == ACK_INSULIN_RATE:
             self.refused += not accepted
             self.rate_limit = accepted_limit(values, self.rate_limit)
@@ -183,6 +200,9 @@ class Pump:
             pramlintide_rate = pramlintide_rate * rate // asked[0]  # the ratio of the drugs stays
         pramlintide_rate = min(pramlintide_rate, self.pram_rate_limit)
         self._sequence = (self._sequence + 1) % SEQUENCES
+        self.unanswered += len(self._awaited) if self._answers else 0
+        self._awaited = set(ACK_RATES)
+        self._rates = (rate, pramlintide_rate) if op == Op.SET_RATE else None
         rates = {"InsulinRate": rate, "PramlintideRate": pramlintide_rate} if op == Op.SET_RATE else {}
         self._commanded_rate = rate if op == Op.SET_RATE else 0 if op == Op.SUSPEND else None
         turn.send(

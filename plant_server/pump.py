@@ -69,6 +69,7 @@ class Alarm(enum.IntEnum):
     RESERVOIR_EMPTY = 7
     BATTERY_LOW = 8
     BATTERY_EMPTY = 9
+    CTRL_LOST = 21
 
 
 HIGH, MEDIUM = 3, 2
@@ -78,6 +79,7 @@ PRIORITY = {
     Alarm.RESERVOIR_EMPTY: HIGH,
     Alarm.BATTERY_LOW: MEDIUM,
     Alarm.BATTERY_EMPTY: HIGH,
+    Alarm.CTRL_LOST: HIGH,
 }
 """PUMP_Alarm.PumpAlarmPriority of each code (requirement ALM-02)."""
 
@@ -158,6 +160,7 @@ class Pump:
         self._pramlintide_rate = 0
         self._commanded = False  # a set-point is in force, not the schedule
         self._suspended = False
+        self._deserted = False  # the last set-point has expired, and no other came
         self._priming = False
         self._expires = -1  # last step of the set-point in force
         self._sequence: int | None = None
@@ -272,6 +275,7 @@ class Pump:
     def _obey(self, values: dict[str, int], step: int, results: tuple[AckResult, AckResult]) -> None:
         if AckResult.ACCEPTED not in results:
             return
+        self._deserted = False
         self._sequence = values["BasalCmdSeq"]
         self._expires = step + (values["BasalUntilStep"] - step) % 128
         operation = values["BasalOp"]
@@ -294,6 +298,7 @@ class Pump:
         """Nothing is obeyed beyond its expiry."""
         if self._commanded and step > self._expires:
             self._fall_back()
+            self._deserted = True
 
     def _fall_back(self) -> None:
         """The stored schedule of insulin, no pramlintide."""
@@ -409,6 +414,8 @@ class Pump:
                 causes.add((Alarm.RESERVOIR_EMPTY, drug))
             elif chamber.low:
                 causes.add((Alarm.RESERVOIR_LOW, drug))
+        if self._deserted:
+            causes.add((Alarm.CTRL_LOST, AUX_PUMP))
         if not self.powered:
             causes.add((Alarm.BATTERY_EMPTY, AUX_PUMP))
         elif self.battery <= BATTERY_LOW_PERCENT:

@@ -64,7 +64,7 @@ GENERATED_DAYS = 14
 
 BUILT_IN = ("fasting", "six-hours", "validation-14d", "tuning", "camerlingo")
 
-SIX_HOURS = ((60, "Breakfast", 50.0), (180, "Snack", 20.0), (270, "Lunch", 60.0))
+SIX_HOURS = ((60.0, "Breakfast", 50.0), (180.0, "Snack", 20.0), (270.0, "Lunch", 60.0))
 """Minute of the day, type, g: three meals before 06:00, told exactly and in time, for tests of a few hours."""
 
 COLUMNS = ("day", "type", "time", "cho_g")
@@ -162,7 +162,9 @@ def _built_in(name: str, seed: int, patient: str, days: float | None) -> Scenari
         return Scenario("fasting", DAYS_MAX, ())
     if name == "six-hours":
         length = 1 if days is None else max(math.ceil(days), 1)
-        meals = [(day * MINUTES_PER_DAY + minute, kind, carbs) for day in range(length) for minute, kind, carbs in SIX_HOURS]
+        meals = [
+            (day * MINUTES_PER_DAY + minute, kind, carbs) for day in range(length) for minute, kind, carbs in SIX_HOURS
+        ]
         return Scenario("six-hours", length, planned(meals, length))
     if name == "tuning":
         return tuning(seed, patient)

@@ -411,7 +411,7 @@ WRONG_YAML = {
     "meals:\n  - {day: 1, time: '23:00', type: Snack, carbs: -5}": "2: meals.0.carbs",
     "meals:\n  - {day: 1, time: '23:00', type: Snack, grams: 5}": "unknown key",
     "days: 3": "give the meals, or based_on",
-    "based_on: breakfast": "based_on is one of fasting, six-hours, validation-14d, tuning, camerlingo, found 'breakfast'",
+    "based_on: breakfast": "based_on is one of fasting, six-hours, validation-14d, tuning, camerlingo, found 'b",
     "based_on: validation-14d\ndays: 15": "days: scenario validation-14d has 14 days, asked for 15",
     "meals: []\nrescue: {below: 5}": "2: rescue.below",
     "meals: []\nannouncements: {missed: 1.5}": "2: announcements.missed",

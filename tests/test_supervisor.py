@@ -511,7 +511,7 @@ def test_a_rate_over_the_pumps_limit_is_never_asked_for_again() -> None:
     assert turn.command["PramlintideRate"] == pytest.approx(
         145, abs=1
     )  # the ratio of what is given, not of what is not
-    assert turn.diag["SequenceErrorCount"] == errors + 1
+    assert turn.diag["SequenceErrorCount"] == errors + 2  # the refusal, and no answer for the other drug
     assert all(bench.step(HIGH + 5 * k).rate == 290 for k in range(6))
     turn = answer(bench, bench.step(HIGH), 1, 3, 0)
     assert turn.rate == 0

@@ -6,12 +6,13 @@
     outcome.assert_state("Degraded", at="02:25")
     outcome.assert_ledger_closes()
 
-Times are simulated, "hh:mm[:ss]" or "days+hh:mm". On `inproc` nothing is written unless it is asked for; on any other bus
-the run leaves its folder.
+Times are simulated, "hh:mm[:ss]" or "days+hh:mm". On `inproc` nothing is written unless it is asked for; on any other
+bus the run leaves its folder.
 """
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -196,7 +197,7 @@ class Outcome:
         column = self.trace.get("CtrlState")
         changes: list[tuple[int, str]] = []
         for time, code in zip(self.trace.time_s.tolist(), column.tolist(), strict=True):
-            if code == code and (not changes or names[int(code)] != changes[-1][1]):  # not NaN
+            if not math.isnan(code) and (not changes or names[int(code)] != changes[-1][1]):
                 changes.append((int(time), names[int(code)]))
         return changes
 

@@ -1,7 +1,7 @@
 """The catalogue of faults: what each puts to the test, and who notices it.
 
-An entry is a typical fault of a kind, at work in the first six hours of a run. What it is seen by was found by running it
-on the reference firmware; the matrix (`pumpbench.matrix`) holds every entry to it, in all modes.
+An entry is a typical fault of a kind, at work in the first six hours of a run. What it is seen by was found by running
+it on the reference firmware; the matrix (`pumpbench.matrix`) holds every entry to it, in all modes.
 """
 
 from typing import Any, NamedTuple

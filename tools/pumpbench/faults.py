@@ -131,8 +131,6 @@ def _members(union: Any) -> list[type[Any]]:
 KINDS: dict[str, type[Any]] = {kind_of(fault): fault for fault in _members(AnyFault)}
 """Every kind of fault by its name."""
 
-__all__ = ["KINDS", "AnyFault", "Fault", "FaultFile", "Faults", "Maker", "dump", "kind_of", "load", "write_wire", *KINDS]
-
 
 def __getattr__(name: str) -> Maker:
     """The maker of each kind: `pumpbench.faults.drop` and so on."""

@@ -15,8 +15,8 @@ from can_bus.lockstep import Done, Phase
 from plant_server import mechanism
 
 WATCHED = (
-    "SYNC_Step", "SYNC_Done", "CGM_Reading", "PUMP_BasalCmd", "PUMP_Delivered", "CTRL_Status", "CTRL_Alarm",
-    "CTRL_Diag", "CFG_Param", "PLANT_Truth", "FAULT_Inject", "PUMP_BolusCmd", "PUMP_Ack", "PUMP_BolusState", "HB_CTRL",
+    "SYNC_Step", "SYNC_Done", "CGM_Reading", "PUMP_BasalCmd", "CTRL_Status", "CTRL_Alarm",
+    "CTRL_Diag", "CFG_Param", "FAULT_Inject", "PUMP_BolusCmd", "PUMP_Ack", "PUMP_BolusState", "HB_CTRL",
     "MODE_Cmd",
 )  # fmt: skip
 
@@ -257,6 +257,51 @@ class _ResetWatch:
         return mode or meal or iob
 
 
+class _LedgerWatch:
+    """H6: what the pump says it has delivered against the plant's truth, on the pump's own bus."""
+
+    def __init__(self, hazards: Hazards) -> None:
+        self._hazards = hazards
+        self._receiver = Receiver(("SYNC_Step", "PUMP_Delivered", "PLANT_Truth"))
+        self._boot_count: int | None = None
+        self._base: dict[str, int] = {"Insulin": 0, "Pram": 0}  # strokes delivered before the totals began
+        self._totals: dict[str, int] | None = None
+
+    def watch(self, frame: Frame) -> None:
+        """Take a frame of the pump's bus."""
+        check, name, values, _ = self._receiver.receive(frame)
+        if check > Check.OK_SOME_LOST:
+            return
+        if name == "SYNC_Step":
+            if values["SyncPhase"] != Phase.CONTINUE:
+                self._totals = None  # the batch of the next instant follows
+            self._hazards.step = values["StepIndex"]
+        elif name == "PUMP_Delivered":
+            self._totals = values
+            self._note_boot(values["PumpBootCount"])
+        elif self._totals is not None:
+            self._compare(values, self._totals)
+
+    def _note_boot(self, boot_count: int) -> None:
+        if boot_count >= BOOT_COUNT_SNA:
+            return
+        if self._boot_count not in (None, boot_count):
+            self._base = {}  # the totals have begun anew, the ledger has not
+        self._boot_count = boot_count
+
+    def _compare(self, truth: dict[str, int], totals: dict[str, int]) -> None:
+        if truth["TruthSel"] == INSULIN_LEDGER:
+            self._check(truth, "Insulin", totals["InsulinTotal"], round(mechanism.INSULIN_STROKE_U * 1000))
+        elif truth["TruthSel"] == PRAM_LEDGER:
+            self._check(truth, "Pram", totals["PramTotal"], round(mechanism.PRAMLINTIDE_STROKE_UG * 100))
+
+    def _check(self, truth: dict[str, int], drug: str, total: int, stroke: int) -> None:
+        open_strokes = truth[f"Truth{drug}Pending"] + truth[f"Truth{drug}Lost"]
+        before = (truth[f"Truth{drug}Commanded"] - open_strokes - total // stroke) % 16384
+        if total % stroke or before != self._base.setdefault(drug, before):
+            self._hazards["H6"] += 1
+
+
 class Monitor:
     """Counts hazards frame by frame."""
 
@@ -266,11 +311,10 @@ class Monitor:
 
     def _start(self) -> None:
         self.hazards = Hazards()
+        self._ledger = _LedgerWatch(self.hazards)
         self._resets = _ResetWatch(self.hazards)
         self._boluses = _BolusWatch(self.hazards)
         self._step = -1  # of the newest token
-        self._boot_count: int | None = None
-        self._ledger_base: dict[str, int] = {"Insulin": 0, "Pram": 0}  # strokes delivered before the totals began
         self._taken: int | None = None
         self._sequences: set[int] = set()
         self._fresh: list[tuple[int, int]] = []  # (sequence, sample step mod 256) of this step's usable samples
@@ -280,13 +324,15 @@ class Monitor:
         self._used: int | None = None
         self._state: int | None = None
         self._lost_alarm = False
-        self._totals: dict[str, int] | None = None
         self._phase: int = Phase.INIT
         self.limiter_steps = 0
         self.diag: dict[str, int] | None = None
 
-    def watch(self, frames: Iterable[Frame]) -> None:
-        """Take frames of the device's bus in order."""
+    def watch(self, frames: Iterable[Frame], pump: Iterable[Frame] | None = None) -> None:
+        """Take frames of the device's bus in order, and of the pump's bus if a gateway with faults lies between."""
+        frames = list(frames)
+        for frame in frames if pump is None else pump:
+            self._ledger.watch(frame)
         for frame in frames:
             check, name, values, _ = self._receiver.receive(frame)
             if check <= Check.OK_SOME_LOST:
@@ -319,31 +365,6 @@ class Monitor:
     def _on_pump_bolusstate(self, values: dict[str, int]) -> None:
         self._boluses.state(values, self._step + 1)
         self._resets.bolus(values)
-
-    def _on_pump_delivered(self, values: dict[str, int]) -> None:
-        self._totals = values
-        boot_count = values["PumpBootCount"]
-        if boot_count >= BOOT_COUNT_SNA:
-            return
-        if self._boot_count not in (None, boot_count):
-            self._ledger_base = {}  # the totals have begun anew, the ledger has not
-        self._boot_count = boot_count
-
-    def _on_plant_truth(self, values: dict[str, int]) -> None:
-        if self._totals is None:
-            return
-        if values["TruthSel"] == INSULIN_LEDGER:
-            stroke = round(mechanism.INSULIN_STROKE_U * 1000)
-            self._check_ledger(values, "Insulin", self._totals["InsulinTotal"], stroke)
-        elif values["TruthSel"] == PRAM_LEDGER:
-            stroke = round(mechanism.PRAMLINTIDE_STROKE_UG * 100)
-            self._check_ledger(values, "Pram", self._totals["PramTotal"], stroke)
-
-    def _check_ledger(self, values: dict[str, int], drug: str, total: int, stroke: int) -> None:
-        open_strokes = values[f"Truth{drug}Pending"] + values[f"Truth{drug}Lost"]
-        before = (values[f"Truth{drug}Commanded"] - open_strokes - total // stroke) % 16384
-        if total % stroke or before != self._ledger_base.setdefault(drug, before):
-            self.hazards["H6"] += 1
 
     def _on_fault_inject(self, values: dict[str, int]) -> None:
         if values["FaultKind"] == MEMORY_LOST:
@@ -388,7 +409,6 @@ class Monitor:
             self._boluses.close_step(uncertain=self._state == STATE_UNCERTAIN)
         self._fresh = []
         self._command = None
-        self._totals = None
 
     def _judge(self, step: int) -> None:
         for sequence, sample_step in self._fresh:
@@ -432,5 +452,7 @@ class Monitor:
             "limiter_steps": self.limiter_steps,
             "ledger": ledger,
             "hazards": hazards,
-            "first_hazards": [{"step": step, "hazard": name} for step, name in self.hazards.found[:FIRST_HAZARDS]],
+            "first_hazards": [
+                {"step": step, "hazard": name} for step, name in sorted(self.hazards.found)[:FIRST_HAZARDS]
+            ],
         }

@@ -38,7 +38,7 @@ def measure(trace: "Trace", frames: "Frames") -> dict[str, Any]:
 
     Args:
         trace: of the run, one row per sampling instant; the final instant is no sample of its own.
-        frames: of the run; hazards are judged on the device's bus.
+        frames: of the run; hazards are judged on the device's bus, the ledger on the pump's.
 
     Returns:
         Outcome metrics (percent of samples, U and ug per day) and, under `safety`, counters, ledger and hazards.
@@ -53,7 +53,7 @@ def measure(trace: "Trace", frames: "Frames") -> dict[str, Any]:
         outcome["insulin_u_per_day"] = _last(trace.get("InsulinTotal")) / days
         outcome["pramlintide_ug_per_day"] = _last(trace.get("PramTotal")) / days
     monitor = Monitor()
-    monitor.watch(frames.frames(0))
+    monitor.watch(frames.frames(0), frames.frames(1) if (frames.channel == 1).any() else None)
     ledger = {
         "insulin": _ledger(trace, "Insulin", "InsulinTotal", INSULIN_STROKE_U),
         "pramlintide": _ledger(trace, "Pram", "PramTotal", PRAMLINTIDE_STROKE_UG),
