@@ -30,8 +30,10 @@ def seconds(text: Any) -> int:
 
 
 def clock(time: int) -> str:
-    """The text that `seconds` reads as this time."""
-    return f"{time // 86400}+{time // 3600 % 24:02}:{time // 60 % 60:02}:{time % 60:02}"
+    """The text that `seconds` reads as this time; no longer than it has to be."""
+    days = f"{time // 86400}+" if time >= 86400 else ""
+    rest = f":{time % 60:02}" if time % 60 else ""
+    return f"{days}{time // 3600 % 24:02}:{time // 60 % 60:02}{rest}"
 
 
 def known(name: Any, names: Iterable[str], what: str) -> str:

@@ -86,6 +86,13 @@ def dump(faults: Iterable[Any]) -> str:
     return "faults:\n" + "".join(f"  - {line}\n" for line in lines) if lines else "faults: []\n"
 
 
+def call(fault: Any) -> str:
+    """The Python that makes a fault, with `faults` for this module: "faults.drop(message='HB_PUMP', start='02:00')"."""
+    keys = fault.model_dump(mode="json", exclude_defaults=True)
+    keys.pop("kind", None)
+    return f"faults.{fault.kind}({', '.join(f'{name}={value!r}' for name, value in keys.items())})"
+
+
 def write_wire(faults: Faults, path: Path) -> None:
     """Write the wire's part as a fault file of its own, for the gateway."""
     path.write_text(dump(faults.wire), encoding="utf-8")

@@ -20,6 +20,8 @@ WATCHED = (
     "MODE_Cmd",
 )  # fmt: skip
 
+PUMP_SIDE = ("SYNC_Step", "PUMP_BolusCmd", "PUMP_Ack", "PUMP_BolusState", "PUMP_Delivered", "PLANT_Truth")
+
 MEAL_IDS, MEAL_SNA = 255, 255
 IOB_KEPT, IOB_SLACK = 0.75, 50.0
 """Share of the insulin on board that is left after a step, and 0.01 U besides: no insulin in use fades faster (H8)."""
@@ -93,6 +95,21 @@ class Hazards(dict[str, int]):
         super().__setitem__(name, count)
 
 
+class _Only:
+    """A part of the counts: what else is counted through it is nobody's."""
+
+    def __init__(self, hazards: Hazards, *names: str) -> None:
+        self._hazards = hazards
+        self._names = names
+
+    def __getitem__(self, name: str) -> int:
+        return self._hazards[name]
+
+    def __setitem__(self, name: str, count: int) -> None:
+        if name in self._names:
+            self._hazards[name] = count
+
+
 @dataclass
 class _Bolus:
     """One BolusId of one drug, as the bus has shown it so far."""
@@ -112,7 +129,7 @@ class _Bolus:
 class _BolusWatch:
     """Boluses of both drugs: H1, H5, and the part of H2 that is about them."""
 
-    def __init__(self, hazards: Hazards) -> None:
+    def __init__(self, hazards: _Only) -> None:
         self._hazards = hazards
         self.limits = {1: 0, 2: 0}
         self._known: dict[tuple[int, int], _Bolus] = {}  # (drug, BolusId)
@@ -257,12 +274,13 @@ class _ResetWatch:
         return mode or meal or iob
 
 
-class _LedgerWatch:
-    """H6: what the pump says it has delivered against the plant's truth, on the pump's own bus."""
+class _PumpWatch:
+    """What the pump did, on its own bus: H1, and H6 as its totals against the plant's truth."""
 
     def __init__(self, hazards: Hazards) -> None:
         self._hazards = hazards
-        self._receiver = Receiver(("SYNC_Step", "PUMP_Delivered", "PLANT_Truth"))
+        self._boluses = _BolusWatch(_Only(hazards, "H1"))
+        self._receiver = Receiver(PUMP_SIDE)
         self._boot_count: int | None = None
         self._base: dict[str, int] = {"Insulin": 0, "Pram": 0}  # strokes delivered before the totals began
         self._totals: dict[str, int] | None = None
@@ -276,6 +294,12 @@ class _LedgerWatch:
             if values["SyncPhase"] != Phase.CONTINUE:
                 self._totals = None  # the batch of the next instant follows
             self._hazards.step = values["StepIndex"]
+        elif name == "PUMP_BolusCmd":
+            self._boluses.command(values, self._hazards.step)
+        elif name == "PUMP_Ack":
+            self._boluses.ack(values, self._hazards.step)
+        elif name == "PUMP_BolusState":
+            self._boluses.state(values, self._hazards.step + 1)
         elif name == "PUMP_Delivered":
             self._totals = values
             self._note_boot(values["PumpBootCount"])
@@ -311,9 +335,9 @@ class Monitor:
 
     def _start(self) -> None:
         self.hazards = Hazards()
-        self._ledger = _LedgerWatch(self.hazards)
+        self._pump = _PumpWatch(self.hazards)
         self._resets = _ResetWatch(self.hazards)
-        self._boluses = _BolusWatch(self.hazards)
+        self._boluses = _BolusWatch(_Only(self.hazards, "H2", "H5"))
         self._step = -1  # of the newest token
         self._taken: int | None = None
         self._sequences: set[int] = set()
@@ -332,7 +356,7 @@ class Monitor:
         """Take frames of the device's bus in order, and of the pump's bus if a gateway with faults lies between."""
         frames = list(frames)
         for frame in frames if pump is None else pump:
-            self._ledger.watch(frame)
+            self._pump.watch(frame)
         for frame in frames:
             check, name, values, _ = self._receiver.receive(frame)
             if check <= Check.OK_SOME_LOST:

@@ -1,0 +1,159 @@
+"""One run with faults against its twin without them, in this process and without a file: for the matrix and the hunt."""
+
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple, TypeVar
+
+from pumpbench import bench
+
+SIGNS = {
+    "frames_lost": "LostFrameCount",
+    "e2e_errors": "E2eErrorCount",
+    "sequence_errors": "SequenceErrorCount",
+    "saturations": "SaturationCount",
+}
+"""Counters under `safety` -> signals of CTRL_Diag."""
+
+LOW, HIGH = 54.0, 250.0
+"""mg/dL."""
+
+ENTRIES_PER_ROUND = 4
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+class Probe(NamedTuple):
+    """A run to be judged."""
+
+    patient: str = "adult#001"
+    mode: str = "s2"
+    seed: int = 1
+    scenario: str = "six-hours"
+    hours: float = 6.0
+    faults: tuple[Any, ...] = ()
+    bus: str = "inproc"
+    firmware: str | None = None
+
+    @property
+    def twin(self) -> "Probe":
+        """The same without faults."""
+        return self._replace(faults=())
+
+
+class Verdict(NamedTuple):
+    """What came of it.
+
+    Attributes:
+        hazards: H1 to H8 with their counts; those not found are left out.
+        first: step and name of the first hazard.
+        signs: alarms ("CTRL.CgmLost") and counters ("LostFrameCount") that the twin does not have.
+        injected: actions of faults, as reported on the bus.
+        low, high: minutes below 54 and above 250 mg/dL more than the twin.
+        error: why the run did not come to its end, or "".
+    """
+
+    hazards: dict[str, int]
+    first: tuple[int, str] | None
+    signs: frozenset[str]
+    injected: int
+    low: float = 0.0
+    high: float = 0.0
+    error: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """A hazard was found, or the run broke off."""
+        return bool(self.hazards) or bool(self.error)
+
+
+class _Seen(NamedTuple):
+    alarms: frozenset[str]
+    counters: dict[str, int]
+    low: float
+    high: float
+
+
+def run(probe: Probe) -> bench.Outcome:
+    """Do the run of a probe.
+
+    Raises:
+        as `bench.run`.
+    """
+    return bench.run(
+        patient=probe.patient,
+        strategy=probe.mode,
+        seed=probe.seed,
+        scenario=probe.scenario,
+        hours=probe.hours,
+        faults=probe.faults,
+        bus=probe.bus,
+        firmware=probe.firmware,
+    )
+
+
+@functools.lru_cache(maxsize=256)
+def _twin(probe: Probe) -> _Seen:
+    return _seen(run(probe))
+
+
+def _seen(outcome: bench.Outcome) -> _Seen:
+    alarms = frozenset(f"{event.node}.{event.code}" for event in outcome.raised())
+    return _Seen(alarms, outcome.counters, outcome.minutes_below(LOW), outcome.minutes_above(HIGH))
+
+
+def judge(probe: Probe) -> Verdict:
+    """Do a run and its twin, and compare. A run that breaks off is a verdict, not an error."""
+    try:
+        outcome = run(probe)
+    except (RuntimeError, OSError) as error:  # NodeDied, PlantError, BusLost
+        return Verdict({}, None, frozenset(), 0, error=f"{type(error).__name__}: {error}")
+    found, twin = _seen(outcome), _twin(probe.twin)
+    more = {SIGNS[name] for name in SIGNS if found.counters[name] > twin.counters[name]}
+    firsts = outcome.safety["first_hazards"]
+    return Verdict(
+        outcome.hazards,
+        (firsts[0]["step"], firsts[0]["hazard"]) if firsts else None,
+        (found.alarms - twin.alarms) | more,
+        outcome.safety["faults_injected"],
+        found.low - twin.low,
+        found.high - twin.high,
+    )
+
+
+def in_parallel(
+    function: Callable[[Item], Answer],
+    items: Sequence[Item],
+    jobs: int,
+    told: Callable[[int], None] = lambda done: None,
+) -> Iterator[Answer]:
+    """The answers in the order of the items, from so many processes; none is started for one job."""
+    if jobs == 1:
+        for done, item in enumerate(items, 1):
+            yield function(item)
+            told(done)
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        try:
+            for done, answer in enumerate(pool.map(function, items, chunksize=ENTRIES_PER_ROUND), 1):
+                yield answer
+                told(done)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def jobs_or(jobs: int | None) -> int:
+    """So many, or one per CPU that this process may use."""
+    import os  # noqa: PLC0415
+
+    return jobs or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else jobs or os.cpu_count() or 1
+
+
+def signs_of(verdicts: Iterable[Verdict]) -> dict[str, int]:
+    """How many runs showed each sign."""
+    counts: dict[str, int] = {}
+    for verdict in verdicts:
+        for sign in verdict.signs:
+            counts[sign] = counts.get(sign, 0) + 1
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
