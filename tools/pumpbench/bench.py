@@ -21,14 +21,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from can_bus import codec
 from can_bus.faults import clock, seconds
+from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench import rig
 from pumpbench.capture import Capture, Frames
 from pumpbench.faults import Faults
 from pumpbench.outcome import measure
 from pumpbench.runfolder import RunFolder
-from pumpbench.trace import AlarmEvent, Trace, labels
+from pumpbench.trace import AlarmEvent, Signal, Trace, labels, signals
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -99,7 +101,22 @@ def run(
     return Outcome.load(rig.execute(prepared))
 
 
-@dataclass(eq=False)
+def frame_text(frame: Frame) -> str:
+    """A frame in words: its message and signals in physical values, or its id and bytes if it is none of the DBC."""
+    message = codec.messages_by_id().get(frame.can_id)
+    if message is None or len(frame.data) != message.length:
+        what = "error frame" if frame.is_error else "remote frame" if frame.is_remote else "frame"
+        return f"{what} 0x{frame.identifier:X}{' (29 bits)' if frame.is_extended else ''} [{frame.data.hex(' ')}]"
+    table = signals(message.name)
+    words = [f"{name}={_value_text(table[name], raw)}" for name, raw in message.unpack(frame.data).items()]
+    return f"{message.name} {' '.join(words)}"
+
+
+def _value_text(signal: Signal, raw: int) -> str:
+    return signal.choices.get(raw) or signal.text(raw).replace(" ", "")
+
+
+@dataclass(eq=False, repr=False)
 class Outcome:
     """What came of a run.
 
@@ -142,6 +159,9 @@ class Outcome:
         folder.write_all(self.frames, self.info, self.metrics, self.trace)
         self.folder = folder.path
         return folder.path
+
+    def __repr__(self) -> str:
+        return f"<Outcome of {self.title}>"
 
     # ---- what happened
 
@@ -211,8 +231,20 @@ class Outcome:
         before = [name for since, name in self.states() if since <= time]
         return before[-1] if before else "nothing yet"
 
+    @property
+    def title(self) -> str:
+        """Which run it was."""
+        keys = ("patient", "strategy", "scenario", "seed", "bus", "firmware")
+        return ", ".join(f"{key} {self.info[key]}" for key in keys if key in self.info)
+
+    def frames_of(self, step: int, limit: int = 40) -> str:
+        """The frames of an instant on the device's bus, decoded, one a line; what a turn asks for and its answer."""
+        rows = np.flatnonzero((self.frames.step == step) & (self.frames.channel == 0))
+        lines = [f"{self.frames.time_s[row]:12.6f}  {frame_text(self.frames.frame(int(row)))}" for row in rows[:limit]]
+        return "\n".join([*lines, *([f"... and {len(rows) - limit} more"] if len(rows) > limit else [])])
+
     def story(self, limit: int = 12) -> str:
-        """What went wrong first, decoded: hazards, faults and alarms in order of time, one a line."""
+        """What went wrong, in order of time: hazards, faults, alarms, states; and the frames of the first hazard."""
         lines = [(int(step) * STEP_SECONDS, 0, f"HAZARD {name}") for step, name in self._hazards_by_step()]
         lines += [(int(span.start_s), 1, f"fault {span.label}") for span in self.trace.fault_spans()]
         lines += [
@@ -221,7 +253,12 @@ class Outcome:
         lines += [(time, 3, f"CTRL is {name}") for time, name in self.states()[1:]]
         lines.sort()
         shown = [f"{clock(time)}  {text}" for time, _, text in lines[:limit]]
-        return "\n".join([*shown, *([f"... and {len(lines) - limit} more"] if len(lines) > limit else [])])
+        shown += [f"... and {len(lines) - limit} more"] if len(lines) > limit else []
+        hazards = self._hazards_by_step()
+        if hazards:
+            step, name = hazards[0]
+            shown += [f"the frames of step {step}, in which {name} was found:", self.frames_of(step)]
+        return "\n".join(shown)
 
     def _hazards_by_step(self) -> list[tuple[int, str]]:
         return [(entry["step"], entry["hazard"]) for entry in self.safety["first_hazards"]]
@@ -230,20 +267,24 @@ class Outcome:
 
     def assert_no_hazards(self) -> None:
         """None of H1 to H8 was counted."""
+        __tracebackhide__ = True
         assert not self.hazards, f"hazards were counted: {self.hazards}; first: {self._hazards_by_step()[0]}"
 
     def assert_ledger_closes(self) -> None:
         """Every stroke of both drugs is accounted for."""
+        __tracebackhide__ = True
         for drug, ledger in self.safety["ledger"].items():
             assert ledger["closes"], f"the {drug} ledger does not close: {ledger}"
 
     def assert_state(self, name: str, *, at: str) -> None:
         """The device was in this CtrlState."""
+        __tracebackhide__ = True
         found = self.state(at)
         assert found == name, f"CTRL was {found} at {at}, not {name}; its states: {self._told(self.states())}"
 
     def assert_back_to(self, name: str, *, after: str, within: str) -> None:
         """From `after` on the device takes up, or keeps, this CtrlState within a time, and is in it then."""
+        __tracebackhide__ = True
         self.state(after)
         deadline = seconds(after) + seconds(within)
         found = self.state(clock(deadline))
@@ -255,6 +296,7 @@ class Outcome:
         self, code: str, *, after: str = "00:00", within: str | None = None, node: str = "CTRL"
     ) -> AlarmEvent:
         """An alarm with this code was raised at or after a time, at most `within` later; returns it."""
+        __tracebackhide__ = True
         begin = seconds(after)
         end = None if within is None else begin + seconds(within)
         raised = self.raised(node=node)
@@ -267,6 +309,7 @@ class Outcome:
 
     def assert_no_alarm(self, code: str, *, after: str = "00:00", node: str = "CTRL") -> None:
         """No alarm with this code was raised at or after a time."""
+        __tracebackhide__ = True
         begin = seconds(after)
         found = [event for event in self.raised(code, node) if event.time_s >= begin]
         assert not found, f"{node} raised {code} at {clock(int(found[0].time_s))}"
@@ -282,6 +325,7 @@ class Outcome:
         end: str | None = None,
     ) -> None:
         """No rate and no bolus commanded in a window was above these."""
+        __tracebackhide__ = True
         first, last = seconds(start), None if end is None else seconds(end)
         inside = (self.trace.time_s >= first) & (self.trace.time_s < (np.inf if last is None else last))
         for what, limit, column in (

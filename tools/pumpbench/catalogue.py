@@ -38,6 +38,11 @@ class Entry(BaseModel):
             raise ValueError(f"modes are of {', '.join(MODES)}")
         return self
 
+    @property
+    def noticed(self) -> str:
+        """Who notices, in words."""
+        return f"seen by {', '.join(self.seen_by)}" if self.seen_by else f"not seen: {self.unseen}"
+
 
 class CatalogueFile(BaseModel):
     """The layout of catalogue.yaml."""

@@ -3,17 +3,24 @@
 import contextlib
 import signal
 import sys
-from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from pumpbench import __version__
-
-EXIT_WRONG, EXIT_USAGE, EXIT_DEAD, EXIT_INTERRUPTED = 1, 2, 3, 130
+from pumpbench.cli_faults import faults_command, hunt, matrix
+from pumpbench.terminal import (
+    EXIT_DEAD,
+    EXIT_INTERRUPTED,
+    EXIT_USAGE,
+    EXIT_WRONG,
+    Failed,
+    console,
+    errors,
+    progress_bar,
+)
 
 app = typer.Typer(
     name="pumpbench",
@@ -23,10 +30,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # a usage error is a line, not a box
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
-
-
 PATIENTS = "A name, a comma list, or all; file.csv#name or file.csv for patients of your own, with --controller."
 SCENARIOS = "validation-14d, tuning, camerlingo, fasting, six-hours, or a YAML or CSV file."
 SENSORS = "coloured, ideal, breton, facchinetti, dexcom-g5, dexcom-g6, vettoretti, or a YAML file."
@@ -45,14 +48,6 @@ class Strategy(StrEnum):
     S2 = "s2"
     S3 = "s3"
     S4 = "s4"
-
-
-class Failed(Exception):
-    """A command has failed with this exit status; the text is the one line the user gets."""
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
 
 
 def _version(wanted: bool) -> None:
@@ -159,7 +154,7 @@ def _execute(prepared: list[Any]) -> list[Path]:
     from pumpbench import rig  # noqa: PLC0415
 
     folders = []
-    with _progress() as progress:
+    with progress_bar() as progress:
         for one in prepared:
             show = progress(f"{one.request.patient} {one.request.strategy}")
             steps = one.request.steps
@@ -273,7 +268,7 @@ def campaign(
                 physiology=physiology,
                 model=controller_model(name, own, controller),
             )
-    with _progress() as progress:
+    with progress_bar() as progress:
         results = campaigns.execute(
             jobs, out / "results", workers=workers, cluster=cluster, via=via, progress=progress("runs")
         )
@@ -304,30 +299,13 @@ def study(
         raise Failed(EXIT_USAGE, f"{error.name} is missing: pip install 'pumpbench[study]'") from None
     names = tuple(_patients(patient))
     models = {name: controller_model(name, load_patient(name), controller) for name in names}
-    with _progress() as progress:
+    with progress_bar() as progress:
         settings = run.Settings(
             out, plan.Cohort(names, models), days, tuple(campaigns.seed_list(seeds)), workers, cluster, via, quick
         )
         say = progress("study")
         report = run.Study(settings, lambda text: errors.print(text, markup=False), say).run()
     console.print(f"report: {report}", soft_wrap=True)
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str], Callable[[int, int], None]]]:
-    """A bar with an estimate of the end, for a count of things done; what begins next takes its place."""
-    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn  # noqa: PLC0415
-
-    columns = (*Progress.get_default_columns()[:3], MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-
-        def begin(what: str) -> Callable[[int, int], None]:
-            for over in bar.task_ids:
-                bar.remove_task(over)
-            task = bar.add_task(what, total=None)
-            return lambda done, of: bar.update(task, completed=done, total=of)
-
-        yield begin
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
@@ -391,8 +369,6 @@ def plant(
     step_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware in a step.")] = 10.0,
 ) -> None:
     """Start the plant alone: patient, sensor, pump and user, for people who bring the firmware."""
-    import contextlib  # noqa: PLC0415
-
     from can_bus.hub import Hub  # noqa: PLC0415
     from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
     from can_bus.url import open_link  # noqa: PLC0415
@@ -461,6 +437,11 @@ def benchmark(
         errors.print("no vcan on this machine and tools/with_vcan could not provide one: its figures are missing")
 
 
+app.command(name="faults")(faults_command)
+app.command()(matrix)
+app.command()(hunt)
+
+
 class Interrupted(Exception):
     """Ctrl-C or SIGTERM."""
 
@@ -499,6 +480,7 @@ def _status(error: Exception) -> int | None:
     from pumpbench.campaign import CampaignError, ClusterError  # noqa: PLC0415
     from pumpbench.closed_loop import CaseError, LoopError  # noqa: PLC0415
     from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
+    from pumpbench.hunt import HuntError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
 
@@ -509,7 +491,7 @@ def _status(error: Exception) -> int | None:
     wrong = (
         CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
     )
-    if isinstance(error, wrong | CalibrationError | ControllerModelError | RigError | RunFolderError):
+    if isinstance(error, wrong | CalibrationError | ControllerModelError | HuntError | RigError | RunFolderError):
         return EXIT_USAGE
     if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD

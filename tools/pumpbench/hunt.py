@@ -1,10 +1,11 @@
 """Random campaigns of faults: cases by seed, a verdict for each, and what failed made as small as it goes.
 
-Case n of a seed is always the same: patient, mode, scenario, length and one to four faults. A run fails when a hazard is
-found or it breaks off. A failure is shrunk, one change at a time as long as it still fails in the same way: fewer faults,
-a shorter run, narrower windows, plainer keys, a plainer patient. What is left is written as a test.
+Case n of a seed is always the same: patient, mode, scenario, length and one to four faults. A run fails when a hazard
+is found or it breaks off. A failure is shrunk, one change at a time as long as it still fails in the same way: fewer
+faults, a shorter run, narrower windows, plainer keys, a plainer patient. What is left is written as a test.
 """
 
+import functools
 import json
 import random
 from collections.abc import Callable, Iterator, Sequence
@@ -20,13 +21,16 @@ from pumpbench import faults as make
 from pumpbench.calibration import MODES
 from pumpbench.faults import AnyFault, call
 from pumpbench.files import write_file
-from pumpbench.probe import Probe, Verdict, judge
+from pumpbench.probe import Probe, Verdict, in_parallel, judge
 
 CASES = "cases.jsonl"
 SHRINK_AT_MOST = 150
 """Runs spent on making one failure smaller."""
 
 FAULTS_AT_MOST = 4
+
+SCENARIOS = (("six-hours", 6.0), ("six-hours", 6.0), ("validation-14d", 24.0), ("camerlingo", 24.0))
+"""And hours; the short one as often as both days together."""
 
 TO_DEVICE = ("CGM_Reading", "CGM_Status", "PUMP_Status", "PUMP_Delivered", "PUMP_BolusState", "PUMP_Ack", "PUMP_Alarm",
              "MEAL_Announce", "UI_AlarmAck", "HB_PUMP", "HB_CGM", "PLANT_Truth")  # fmt: skip
@@ -53,7 +57,7 @@ _ADAPTER: TypeAdapter[Any] = TypeAdapter(AnyFault)
 class Found(NamedTuple):
     """A failure: the case as drawn, what is left of it, and the verdict on that."""
 
-    index: int
+    number: int
     drawn: Probe
     left: Probe
     verdict: Verdict
@@ -260,12 +264,12 @@ def as_test(found: Found, seed: int) -> str:
     else:
         what = verdict.error or "nothing"
     lines = ",\n".join(f"            {call(fault)}" for fault in probe.faults)
-    return f'''"""Found by `pumpbench hunt --seed {seed}`, case {found.index}: {what}."""
+    return f'''"""Found by `pumpbench hunt --seed {seed}`, case {found.number}: {what}."""
 
 from pumpbench import faults
 
 
-def test_seed_{seed}_case_{found.index}(bench):
+def test_seed_{seed}_case_{found.number}(bench):
     outcome = bench.run(
         patient="{probe.patient}",
         strategy="{probe.mode}",
@@ -327,6 +331,97 @@ class HuntError(ValueError):
 
 def keep(found: Found, seed: int, folder: Path) -> Path:
     """Write the test of a failure; returns its file."""
-    path = folder / f"test_hunt_{seed}_{found.index}.py"
+    path = folder / f"test_hunt_{seed}_{found.number}.py"
     write_file(path, as_test(found, seed).encode())
     return path
+
+
+# ---- a hunt
+
+
+class Settings(NamedTuple):
+    """A hunt as asked for."""
+
+    out: Path
+    runs: int
+    seed: int = 1
+    modes: tuple[str, ...] = tuple(MODES)
+    jobs: int = 1
+    bus: str = "inproc"
+    firmware: str | None = None
+    max_low: float | None = (
+        None  # minutes below 54 mg/dL more than the twin that are a failure; None: any number is not
+    )
+    max_high: float | None = None
+
+
+class Result(NamedTuple):
+    """What a hunt came to."""
+
+    runs: int
+    injected: int
+    failed: int
+    lowest: list[tuple[int, float]]  # case and minutes below 54 mg/dL more than its twin, the worst first
+    highest: list[tuple[int, float]]
+
+
+WORST = 5
+
+
+def run(
+    settings: Settings,
+    told: Callable[[int, int], None] = lambda done, total: None,
+    caught: Callable[[Found, Path], None] = lambda found, path: None,
+) -> Result:
+    """Judge the cases that were not judged yet, shrink what fails, keep it.
+
+    Args:
+        settings: of the hunt.
+        told: called with cases done and their number.
+        caught: called with every failure and its test.
+
+    Raises:
+        HuntError: the folder holds another hunt.
+    """
+    limits = {"max_low": settings.max_low, "max_high": settings.max_high}
+    heading = {"seed": settings.seed, "modes": list(settings.modes), "bus": settings.bus,
+               "firmware": settings.firmware, **limits}  # fmt: skip
+    log = Log(settings.out, heading)
+    open_cases = [index for index in range(settings.runs) if index not in log.done]
+    already = settings.runs - len(open_cases)
+    probes = [
+        case(settings.seed, index, settings.modes)._replace(bus=settings.bus, firmware=settings.firmware)
+        for index in open_cases
+    ]
+    judged = functools.partial(_judge_within, settings.max_low, settings.max_high)
+    verdicts = in_parallel(judged, probes, settings.jobs, lambda done: told(already + done, settings.runs))
+    for index, probe, verdict in zip(open_cases, probes, verdicts, strict=True):
+        if verdict.failed:
+            found = Found(index, probe, *shrink(probe, verdict, judged))
+            caught(found, keep(found, settings.seed, settings.out))
+        log.add(index, verdict)  # after its test is kept: what was cut off in between is judged again
+    return _result([log.done[index] for index in range(settings.runs)])
+
+
+def _judge_within(max_low: float | None, max_high: float | None, probe: Probe) -> Verdict:
+    verdict = judge(probe)
+    over = [
+        f"{minutes:g} min {what} mg/dL"
+        for minutes, limit, what in ((verdict.low, max_low, "below 54"), (verdict.high, max_high, "above 250"))
+        if limit is not None and minutes > limit
+    ]
+    return verdict._replace(error=f"Outcome: {', '.join(over)}") if over and not verdict.error else verdict
+
+
+def _result(entries: Sequence[dict[str, Any]]) -> Result:
+    def worst(name: str) -> list[tuple[int, float]]:
+        ranked = sorted(entries, key=lambda entry: -entry[name])[:WORST]
+        return [(entry["case"], entry[name]) for entry in ranked if entry[name] > 0]
+
+    return Result(
+        len(entries),
+        sum(entry["injected"] for entry in entries),
+        sum(bool(entry["hazards"] or entry["error"]) for entry in entries),
+        worst("low"),
+        worst("high"),
+    )

@@ -1,4 +1,4 @@
-"""Every entry of the catalogue in every mode with many seeds: nothing dangerous happens, and what can be seen is seen."""
+"""Every entry of the catalogue in every mode with many seeds: nothing dangerous happens, what can be seen is seen."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -87,3 +87,18 @@ def table(cells: Sequence[Cell]) -> str:
             f"| {entry} | {', '.join(of[0].entry.hazards)} | {len(acted)} of {len(of)} | {hazards} | {seen or reason} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def page(cells: Sequence[Cell]) -> str:
+    """The matrix as a page of docs."""
+    modes, seeds = ({cell.mode for cell in cells}, {cell.seed for cell in cells})
+    wrong = sum(bool(cell.wrong) for cell in cells)
+    return f"""# The matrix of faults
+
+Written by `pumpbench matrix --seeds {len(seeds)} --markdown docs/fault-matrix.md`: every entry of the catalogue
+([faults.md](faults.md)) in {len(modes)} modes with {len(seeds)} seeds over ten patients, six hours with three meals each,
+on the reference firmware: {len(cells)} runs, of which {wrong} were wrong: a hazard, a run that broke off, or a fault
+that was not seen by what should see it. "Seen by" are alarms of the device (CTRL) or of the pump (PUMP) and counters of
+CTRL_Diag that the same run without the fault does not have.
+
+""" + table(cells)

@@ -1,6 +1,7 @@
-"""One run with faults against its twin without them, in this process and without a file: for the matrix and the hunt."""
+"""One run with faults against its twin without them, and many of them at once: for the matrix and the hunt."""
 
 import functools
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple, TypeVar
@@ -145,9 +146,9 @@ def in_parallel(
 
 def jobs_or(jobs: int | None) -> int:
     """So many, or one per CPU that this process may use."""
-    import os  # noqa: PLC0415
-
-    return jobs or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else jobs or os.cpu_count() or 1
+    if jobs is not None:
+        return jobs
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def signs_of(verdicts: Iterable[Verdict]) -> dict[str, int]:
