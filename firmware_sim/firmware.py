@@ -578,7 +578,9 @@ class Firmware:
             self._last_change = step
         down = self._ladder.rung != State.AUTO
         lost = age >= AGE_DEGRADED or (down and (alarms.active(Code.CGM_LOST) or state == self._ladder.rung))
-        alarms.hold(Code.CGM_LOST, lost and self._calibration.active, min(age, 0xFFFF))
+        # without a calibration nothing is dosed, but a sensor that was heard and falls silent is told of all the same
+        listening = self._calibration.active or self._cgm.sequence is not None
+        alarms.hold(Code.CGM_LOST, lost and listening, min(age, 0xFFFF))
         alarms.hold(Code.CGM_IMPLAUSIBLE, step - self._last_implausible < ALARM_HOLD, step)
         alarms.hold(Code.E2E_FAULT, step - self._last_e2e_error < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)

@@ -297,8 +297,8 @@ class Bolusing:
     def watch(self, transmitter: codec.Transmitter, name: str, **values: int) -> None:
         self.monitor.watch([transmitter.frame(name, **values)])
 
-    def token(self) -> None:
-        self.watch(self.transmitter, "SYNC_Step", SyncPhase=Phase.STEP, StepIndex=self.step, SimTime=self.step * 300)
+    def token(self, phase: Phase = Phase.STEP) -> None:
+        self.watch(self.transmitter, "SYNC_Step", SyncPhase=phase, StepIndex=self.step, SimTime=self.step * 300)
 
     def cmd(self, op: int, number: int, dose: int = 200, *, until: int | None = None, drug: int = 1) -> None:
         values = {"BolusHormone": drug, "BolusOp": op, "BolusId": number}
@@ -309,7 +309,9 @@ class Bolusing:
 
     def ack(self, purpose: int, number: int, result: int = 0) -> None:
         values = {"AckFor": purpose, "AckResult": result, "AckId": number, "AckEchoRaw": 200, "AckLimitRaw": 3000}
+        self.watch(self.device, "SYNC_Done", DoneStatus=Done.CONTINUE, DoneStepIndex=self.step, TxCount=1)
         self.watch(self.transmitter, "PUMP_Ack", **values)
+        self.token(Phase.CONTINUE)
 
     def give(self, number: int, dose: int = 200) -> None:
         self.cmd(PROGRAM, number, dose)

@@ -20,7 +20,13 @@ WATCHED = (
     "MODE_Cmd",
 )  # fmt: skip
 
-PUMP_SIDE = ("SYNC_Step", "PUMP_BolusCmd", "PUMP_Ack", "PUMP_BolusState", "PUMP_Delivered", "PLANT_Truth")
+PUMP_SAYS = ("PUMP_Ack", "PUMP_BolusState", "PUMP_Delivered", "PLANT_Truth")
+"""The pump says so ahead of a token; what has one of these ids after it, on the pump's bus, somebody has forged."""
+
+DEVICE_SAYS = frozenset(
+    message.can_id for message in codec.messages().values() if message.sender == "CTRL" and message.name != "HB_CTRL"
+)
+"""The device says so between a token and SYNC_Done; at any other time, on its own bus, somebody has forged it."""
 
 MEAL_IDS, MEAL_SNA = 255, 255
 IOB_KEPT, IOB_SLACK = 0.75, 50.0
@@ -280,16 +286,22 @@ class _PumpWatch:
     def __init__(self, hazards: Hazards) -> None:
         self._hazards = hazards
         self._boluses = _BolusWatch(_Only(hazards, "H1"))
-        self._receiver = Receiver(PUMP_SIDE)
+        self._receiver = Receiver(("SYNC_Step", "SYNC_Done", "PUMP_BolusCmd", *PUMP_SAYS))
+        self._ids = frozenset(codec.message(name).can_id for name in PUMP_SAYS)
+        self._turn = False  # the device has the turn
         self._boot_count: int | None = None
         self._base: dict[str, int] = {"Insulin": 0, "Pram": 0}  # strokes delivered before the totals began
         self._totals: dict[str, int] | None = None
 
     def watch(self, frame: Frame) -> None:
         """Take a frame of the pump's bus."""
+        if self._turn and frame.can_id in self._ids:
+            return
         check, name, values, _ = self._receiver.receive(frame)
         if check > Check.OK_SOME_LOST:
             return
+        if name in ("SYNC_Step", "SYNC_Done"):
+            self._turn = name == "SYNC_Step"
         if name == "SYNC_Step":
             if values["SyncPhase"] != Phase.CONTINUE:
                 self._totals = None  # the batch of the next instant follows
@@ -303,7 +315,7 @@ class _PumpWatch:
         elif name == "PUMP_Delivered":
             self._totals = values
             self._note_boot(values["PumpBootCount"])
-        elif self._totals is not None:
+        elif name == "PLANT_Truth" and self._totals is not None:
             self._compare(values, self._totals)
 
     def _note_boot(self, boot_count: int) -> None:
@@ -336,6 +348,7 @@ class Monitor:
     def _start(self) -> None:
         self.hazards = Hazards()
         self._pump = _PumpWatch(self.hazards)
+        self._turn = True  # the device has the turn, as far as is known
         self._resets = _ResetWatch(self.hazards)
         self._boluses = _BolusWatch(_Only(self.hazards, "H2", "H5"))
         self._step = -1  # of the newest token
@@ -358,8 +371,11 @@ class Monitor:
         for frame in frames if pump is None else pump:
             self._pump.watch(frame)
         for frame in frames:
+            if not self._turn and frame.can_id in DEVICE_SAYS:
+                continue
             check, name, values, _ = self._receiver.receive(frame)
             if check <= Check.OK_SOME_LOST:
+                self._turn = name == "SYNC_Step" or (self._turn and name != "SYNC_Done")
                 getattr(self, f"_on_{name.lower()}")(values)
 
     # ---- what the device was told

@@ -96,7 +96,7 @@ def page(cells: Sequence[Cell]) -> str:
     return f"""# The matrix of faults
 
 Written by `pumpbench matrix --seeds {len(seeds)} --markdown docs/fault-matrix.md`: every entry of the catalogue
-([faults.md](faults.md)) in {len(modes)} modes with {len(seeds)} seeds over ten patients, six hours with three meals each,
+([faults.md](faults.md)) in {len(modes)} modes with {len(seeds)} seeds over ten patients, six hours, three meals each,
 on the reference firmware: {len(cells)} runs, of which {wrong} were wrong: a hazard, a run that broke off, or a fault
 that was not seen by what should see it. "Seen by" are alarms of the device (CTRL) or of the pump (PUMP) and counters of
 CTRL_Diag that the same run without the fault does not have.

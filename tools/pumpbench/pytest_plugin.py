@@ -82,7 +82,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     """A failed test keeps its runs, and says of each what went wrong first."""
     report = yield
     if call.when == "call" and report.failed:
-        for number, outcome in enumerate(item.stash[_RUNS] if _RUNS in item.stash else ()):
+        runs: list[Outcome] = item.stash.get(_RUNS, [])
+        for number, outcome in enumerate(runs):
             report.sections.append((f"pumpbench run {number}", _account(item, outcome, number)))
     return report
 

@@ -151,8 +151,8 @@ def prepare(request: Request) -> Prepared:
     tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
     calibration = calibrate(patient, tuning, model)
     mode = MODES[request.strategy]
-    sensor = sensor.model_copy(update={"effects": (*sensor.effects, *faults.sensor)})
-    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, faults.pump)
+    injected = faults.pump + faults.sensor
+    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, injected)
     PlantServer(run).rehearse()  # checks the rest, and loads compiled code before anybody waits on a bus
     info = {
         "pumpbench": __version__,

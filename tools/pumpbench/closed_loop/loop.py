@@ -17,7 +17,7 @@ from firmware_sim.control import layout
 from firmware_sim.pump import RATE_EXPIRES_AFTER
 from plant_server import mechanism, physiology
 from plant_server.chamber import INSULIN, PRAMLINTIDE
-from plant_server.mechanism import DELIVERED, FLUID, SUBSTEPS
+from plant_server.mechanism import DELIVERED, FLUID, MOTOR_WORDS, SUBSTEPS
 from plant_server.scenario import RESCUE_EATING_MINUTES, SAMPLE_MINUTES
 from pumpbench import compiled
 from pumpbench.closed_loop import device, pump
@@ -169,7 +169,7 @@ def run(plan: Plan, record: Record) -> tuple[Words, Words]:
     steps = record.words.shape[1]
     x = plan.x0.copy()
     body = 0
-    motor, pram_motor = np.zeros(11, np.int64), np.zeros(11, np.int64)
+    motor, pram_motor = np.zeros(MOTOR_WORDS, np.int64), np.zeros(MOTOR_WORDS, np.int64)
     motor[FLUID], pram_motor[FLUID] = INSULIN_CAPACITY, PRAM_CAPACITY
     insulin, pramlintide = np.zeros(SUBSTEPS), np.zeros(SUBSTEPS)
     carbs = np.zeros(SUBSTEPS)
