@@ -326,27 +326,38 @@ class _Device:
         return reports
 
 
-def serve(gateway: Gateway, device: Link, plant: Link) -> None:
+def serve(gateway: Gateway, device: Link, plant: Link, tap: Link | None = None) -> None:
     """Join two buses until the run ends.
+
+    Args:
+        gateway: what becomes of the frames.
+        device: the device's bus; error frames are left out where it cannot carry them (slcan).
+        plant: the plant's bus.
+        tap: gets all frames of the device's bus in order, for a recorder where only one program can open that bus.
 
     Raises:
         BusLost: one of the buses is gone or lost frames.
     """
     sides = {device.fileno(): (device, Side.DEVICE), plant.fileno(): (plant, Side.PLANT)}
     while not gateway.finished:
-        ready, _, _ = select.select(list(sides), [], [])
+        ready, _, _ = select.select(list(sides), [], [], 0.2)
         for descriptor in ready:
             link, side = sides[descriptor]
             to_device: list[Frame] = []
             to_plant: list[Frame] = []
-            for frame in link.recv(0):
+            frames = link.recv(0)
+            for frame in frames:
                 crossing = gateway.forward(frame, side)
                 to_device += crossing.device
                 to_plant += crossing.plant
+            if tap is not None and (to_device or side == Side.DEVICE):
+                tap.send([*(frames if side == Side.DEVICE else ()), *to_device])
             if to_device:
-                device.send(to_device)
+                device.send(to_device if device.carries_errors else [each for each in to_device if not each.is_error])
             if to_plant:
                 plant.send(to_plant)
+        if tap is not None:
+            tap.recv(0)  # nobody speaks there; this runs its hub
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -355,6 +366,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--plant", required=True, metavar="URL", help="the plant's bus")
     parser.add_argument("--device", required=True, metavar="URL", help="the device's bus")
     parser.add_argument("--host", action="store_true", help="serve the device's bus as a hub, from this process")
+    parser.add_argument("--tap", metavar="URL", help="serve a hub that shows the device's bus, for a recorder")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="YAML file of faults")
     switch = parser.add_mutually_exclusive_group()
     switch.add_argument("--node", metavar="CMD", help="switches the device: run with cut, start kept, freeze or thaw")
@@ -384,8 +396,11 @@ def _join(gateway: Gateway, options: argparse.Namespace) -> None:
             device: Link = stack.enter_context(stack.enter_context(Hub(options.device)).local_link())
         else:
             device = stack.enter_context(open_link(options.device))
+        tap: Link | None = None
+        if options.tap:
+            tap = stack.enter_context(stack.enter_context(Hub(options.tap)).local_link())
         print("ready", flush=True)
-        serve(gateway, device, plant)
+        serve(gateway, device, plant, tap)
 
 
 if __name__ == "__main__":

@@ -34,6 +34,10 @@ class Link(Protocol):
     def url(self) -> str:
         """The URL this link was opened with."""
 
+    @property
+    def carries_errors(self) -> bool:
+        """Whether error frames can be sent on it."""
+
     def recv(self, timeout: float | None) -> list[Frame]:
         """Wait until at least one frame is there and return all that arrived, oldest first.
 
@@ -80,6 +84,8 @@ class Wanted:
 
 class BaseLink:
     """What the links have in common: the URL, the filter, the reason of the end, the context manager."""
+
+    carries_errors = True
 
     def __init__(self, url: str, filters: Iterable[int] | None) -> None:
         self._url = url

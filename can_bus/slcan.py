@@ -32,6 +32,8 @@ class SlcanLink(BaseLink):
     serial port's own, and no word about frames that the adapter lost: the counters of the protocol see those.
     """
 
+    carries_errors = False
+
     def __init__(self, bus: can.BusABC, url: str, *, filters: Iterable[int] | None = None) -> None:
         """Take over the serial port of an opened python-can slcan bus."""
         super().__init__(url, filters)

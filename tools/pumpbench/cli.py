@@ -82,7 +82,10 @@ def run(
     ] = None,
     faults: Annotated[Path | None, typer.Option(help="YAML file of faults, acting between device and plant.")] = None,
     firmware: Annotated[
-        str | None, typer.Option(help='Command that starts another firmware; "{bus}" becomes the bus URL.')
+        str | None,
+        typer.Option(
+            help='Command that starts another firmware; {bus} becomes its URL; none: it runs by itself.'
+        ),
     ] = None,
     sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
     physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,

@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import dbc
 from can_bus.faults import MemoryState, NodeFault
@@ -55,6 +55,13 @@ from pumpbench.runfolder import RunFolder
 
 READY_SECONDS = 30.0
 END_SECONDS = 5.0
+
+SERIAL = "slcan:"
+"""Buses that one program opens."""
+
+SOMEBODY_ELSES = "none"
+"""As --firmware: the device runs by itself."""
+
 WRITE_SECONDS = 600.0
 
 PACKAGES = ("numpy", "numba", "python-can", "cantools", "autosar-e2e", "rerun-sdk")
@@ -150,6 +157,8 @@ def prepare(request: Request) -> Prepared:
     sensor = load_sensor(request.sensor)
     tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
     calibration = calibrate(patient, tuning, model)
+    if request.firmware == SOMEBODY_ELSES and any(isinstance(fault, NodeFault) for fault in faults.wire):
+        raise RigError("faults of the device need a firmware that this run starts; --firmware is none")
     mode = MODES[request.strategy]
     injected = faults.pump + faults.sensor
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, injected)
@@ -437,6 +446,41 @@ def _children() -> Iterator[list[Child]]:
             child.end()
 
 
+class _Buses(NamedTuple):
+    """The buses of a run as URLs."""
+
+    plant: str
+    device: str
+    shown: str  # where a recorder sees what is on the device's
+    private: bool  # the plant's is a hub of this run
+    hosted: bool  # the device's is a hub of the gateway
+
+    @classmethod
+    def of(cls, request: Request, place: Path, *, faulty: bool) -> "_Buses":
+        """Which buses a request needs; with faults there are two, and where only one program can open a bus.
+
+        Raises:
+            RigError: the device's bus is not told.
+        """
+        plant, second, tap = (f"unix:{place / name}.sock" for name in ("plant", "device", "tap"))
+        if request.bus == "hub":
+            device = request.device_bus or (second if faulty else plant)
+        elif request.bus.startswith(SERIAL):
+            device = request.bus
+        else:
+            plant = request.bus
+            device = request.device_bus or (_second_bus(plant) if faulty else plant)
+        private = request.bus == "hub" or request.bus.startswith(SERIAL)
+        if not device.startswith(SERIAL):
+            return cls(plant, device, device, private, hosted=device == second)
+        if request.firmware is None:
+            raise RigError(
+                f"only one program can open {device}, and that is the bench: give --firmware "
+                f"{SOMEBODY_ELSES} for a device that runs by itself, or the command that starts it at the other end"
+            )
+        return cls(plant, device, tap if faulty else plant, private, hosted=False)
+
+
 def _second_bus(url: str) -> str:
     match = re.fullmatch(r"(socketcan:.*?)(\d+)", url)
     if match is None:
@@ -452,24 +496,19 @@ def _processes(prepared: Prepared) -> Path:
         place = Path(directory)
         other_cpus = stack.enter_context(_one_cpu())
         children = stack.enter_context(_children())
+        buses = _Buses.of(request, place, faulty=bool(prepared.faults.wire))
         hub: Hub | None = None
-        if request.bus == "hub":
+        if buses.private:
             # when a run breaks off, the reason is said once, by us; who then left frames unread does not matter
             logging.getLogger("can_bus.hub").addHandler(logging.NullHandler())
-            plant_url = f"unix:{place / 'plant.sock'}"
-            hub = stack.enter_context(Hub(plant_url))
+            hub = stack.enter_context(Hub(buses.plant))
             link: Link = stack.enter_context(hub.local_link())
-            device_url = f"unix:{place / 'device.sock'}" if prepared.faults.wire else plant_url
         else:
-            plant_url = request.bus
-            device_url = plant_url
-            if prepared.faults.wire:
-                device_url = request.device_bus or _second_bus(plant_url)
-            link = stack.enter_context(open_link(plant_url))
+            link = stack.enter_context(open_link(buses.plant))
 
         def start(name: str, command: list[str], *, ready: bool, keep: Sequence[int] = ()) -> Child:
             log = stack.enter_context((place / f"{name}.log").open("ab"))
-            environment = os.environ | {"PUMPBENCH_BUS": device_url, "PYTHONUNBUFFERED": "1"}
+            environment = os.environ | {"PUMPBENCH_BUS": buses.device, "PYTHONUNBUFFERED": "1"}
             child = Child(name, command, environment, log, ready, keep)
             children.append(child)
             if name == "recorder" and other_cpus:
@@ -483,21 +522,20 @@ def _processes(prepared: Prepared) -> Path:
                 hub.poll(0)
 
         switch, ours = _switch(prepared, stack)
-        recorder = _start_recorder_side(
-            prepared, place, plant_url, device_url, start, hosted=hub is not None, switch=switch
-        )
-
+        recorder = _start_recorder_side(prepared, place, buses, start, switch)
         nvm = place / "nvm"
 
         def launch(memory: MemoryState) -> Child:
-            return start("firmware", _firmware_command(request, device_url, nvm if ours else None, memory), ready=False)
+            command = _firmware_command(request, buses.device, nvm if ours else None, memory)
+            return start("firmware", command, ready=False)
 
-        firmware = Process(launch, nvm)
-        if ours is not None:
+        firmware = None if request.firmware == SOMEBODY_ELSES else Process(launch, nvm)
+        if ours is not None and firmware is not None:
             threading.Thread(target=attend, args=(ours, firmware), daemon=True).start()
 
         def watch() -> None:
-            firmware.check()
+            if firmware is not None:
+                firmware.check()
             for child in list(children):
                 if child.name != "firmware":
                     child.check()
@@ -528,23 +566,16 @@ def _switch(prepared: Prepared, stack: contextlib.ExitStack) -> tuple[socket.soc
 
 
 def _start_recorder_side(
-    prepared: Prepared,
-    place: Path,
-    plant_url: str,
-    device_url: str,
-    start: Callable[..., Child],
-    *,
-    hosted: bool,
-    switch: socket.socket | None,
+    prepared: Prepared, place: Path, buses: _Buses, start: Callable[..., Child], switch: socket.socket | None
 ) -> Child:
-    """Start the gateway, if there are faults, and the recorder."""
-    request = prepared.request
-    if prepared.faults.wire:
+    """Start the gateway, if there are two buses, and the recorder."""
+    if buses.device != buses.plant:
         wire = place / "faults.yaml"
         write_wire(prepared.faults, wire)
-        command = [sys.executable, "-m", "can_bus.gateway", "--plant", plant_url, "--device", device_url]
+        command = [sys.executable, "-m", "can_bus.gateway", "--plant", buses.plant, "--device", buses.device]
         command += ["--faults", str(wire)]
-        command += ["--host"] if hosted else []
+        command += ["--host"] if buses.hosted else []
+        command += ["--tap", buses.shown] if buses.shown not in (buses.device, buses.plant) else []
         if switch is None:
             start("gateway", command, ready=True)
         else:
@@ -552,10 +583,10 @@ def _start_recorder_side(
                 start("gateway", [*command, "--node-socket", str(switch.fileno())], ready=True, keep=[switch.fileno()])
     info = place / "info.json"
     info.write_text(json.dumps(prepared.info), encoding="utf-8")
-    command = [sys.executable, "-m", "pumpbench.recorder", "--bus", device_url, "--out", str(request.out)]
+    command = [sys.executable, "-m", "pumpbench.recorder", "--bus", buses.shown, "--out", str(prepared.request.out)]
     command += ["--info", str(info), "--overwrite"]
-    if prepared.faults.wire:
-        command += ["--plant-bus", plant_url]
+    if buses.shown != buses.plant:
+        command += ["--plant-bus", buses.plant]
     return start("recorder", command, ready=True)
 
 
