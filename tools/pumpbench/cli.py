@@ -83,9 +83,7 @@ def run(
     faults: Annotated[Path | None, typer.Option(help="YAML file of faults, acting between device and plant.")] = None,
     firmware: Annotated[
         str | None,
-        typer.Option(
-            help='Command that starts another firmware; {bus} becomes its URL; none: it runs by itself.'
-        ),
+        typer.Option(help="Command that starts another firmware; {bus} becomes its URL; none: it runs by itself."),
     ] = None,
     sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
     physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,

@@ -409,6 +409,7 @@ class Monitor:
     def _on_fault_inject(self, values: dict[str, int]) -> None:
         if values["FaultKind"] == MEMORY_LOST:
             self._resets.forget()
+            self._taken = None  # it cannot miss what it does not know of
 
     # ---- what it did
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from can_bus.faults import MemoryState
 from can_bus.frame import Frame
-from firmware_sim.nvm import ERASED, FileMemory, Memory, RamMemory, bank_size, memory_size
+from firmware_sim.nvm import ERASED, HEADER_WORDS, FileMemory, Memory, RamMemory, bank_size, memory_size
 
 if TYPE_CHECKING:
     from pumpbench.rig import Child
@@ -28,7 +28,8 @@ def tear(memory: Memory, words: int) -> None:
         return
     first_is_newer = (generations[0] - generations[1]) % (1 << 32) < 1 << 31
     newest = 0 if written[0] and (not written[1] or first_is_newer) else 1
-    half = size // 4
+    written_words = int.from_bytes(memory.read(newest * size + 4 * (HEADER_WORDS - 2), 4), "little")
+    half = 4 * (HEADER_WORDS + min(written_words, words) // 2)
     memory.write(newest * size + half, bytes([ERASED]) * (size - half))
 
 
