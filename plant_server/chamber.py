@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import mechanism
-from .mechanism import AIR, DELIVERED, FLUID, HELD, PENDING
+from .mechanism import AIR, DELIVERED, DOUBLE_EVERY, FLUID, HELD, MISS_EVERY, PENDING, SLOWED
 
 
 class Occlusion(enum.IntEnum):
@@ -127,6 +127,10 @@ class Chamber:
     def insert_air(self, strokes: int) -> None:
         """An air bubble: the next strokes deliver nothing."""
         self.words[AIR] += strokes
+
+    def mend(self) -> None:
+        """The motor is sound; what is still wrong with it has to be said again."""
+        self.words[[SLOWED, MISS_EVERY, DOUBLE_EVERY]] = 0
 
     def change(self) -> None:
         """The user changes reservoir and line: full again, primed, without air or occlusion."""

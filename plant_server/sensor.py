@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from can_bus import yaml_file
-from can_bus.lockstep import STEP_SECONDS
 
 from .sensors import INSTANTS_PER_DAY, MODELS, SAMPLE_MINUTES, AnyModel, Wear
 from .sensors.coloured import Coloured
@@ -134,7 +133,7 @@ class SensorSettings(BaseModel):
         """Which sensor is worn at each of `count` sampling instants, and for how long."""
         lifetime = self.lifetime_days or self.model.lifetime_days
         life = round(lifetime * INSTANTS_PER_DAY) if lifetime and self.renew else None
-        inserted = {-(-effect.start // STEP_SECONDS) for effect in self.effects if isinstance(effect, Replacement)}
+        inserted = {effect.first_step for effect in self.effects if isinstance(effect, Replacement)}
         wear = Wear.whole_run(count)
         session, age = 0, self.worn_minutes // SAMPLE_MINUTES
         if life is None and not inserted:
@@ -173,8 +172,9 @@ def load_sensor(name: str) -> SensorSettings:
 class _Running:
     """An effect at work in one run."""
 
-    def __init__(self, effect: Effect, numbers: list[float]) -> None:
+    def __init__(self, effect: Effect, numbers: list[float], *, fault: bool) -> None:
         self.effect = effect
+        self.fault = fault
         self.numbers = numbers
         self.memory = Memory()
 
@@ -182,7 +182,9 @@ class _Running:
 class Sensor:
     """One sensor on one patient over one run."""
 
-    def __init__(self, settings: SensorSettings | str, count: int, seed: int, patient: str) -> None:
+    def __init__(
+        self, settings: SensorSettings | str, count: int, seed: int, patient: str, faults: tuple[Effect, ...] = ()
+    ) -> None:
         """Draw the errors of `count` sampling instants.
 
         Args:
@@ -190,11 +192,14 @@ class Sensor:
             count: sampling instants, both ends included.
             seed: of the run.
             patient: name of the virtual patient.
+            faults: effects that somebody injects, besides those of the settings.
 
         Raises:
             SensorError: see `load_sensor`.
         """
-        self.settings = load_sensor(settings) if isinstance(settings, str) else settings
+        settings = load_sensor(settings) if isinstance(settings, str) else settings
+        own = len(settings.effects)
+        self.settings = settings.model_copy(update={"effects": (*settings.effects, *faults)})
         self.wear = self.settings.wear(count)
         self.errors = self.settings.model.draw(
             self.wear, lambda purpose: stream(seed, patient, f"cgm {purpose}" if purpose else "cgm")
@@ -205,9 +210,12 @@ class Sensor:
         self._after: list[_Running] = []
         self._last_stages: list[_Running] = []
         order = list(EFFECTS)
-        for effect in sorted(self.settings.effects, key=lambda effect: (effect.stage, order.index(effect.kind))):
+        effects = enumerate(self.settings.effects)
+        for place, effect in sorted(effects, key=lambda each: (each[1].stage, order.index(each[1].kind))):
             numbers = effect.numbers(count, stream(seed, patient, f"cgm effect {effect.kind} {effect.name}"))
-            self._place(effect).append(_Running(effect, numbers.tolist()))
+            self._place(effect).append(_Running(effect, numbers.tolist(), fault=place >= own))
+        self._faults = [running for running in (*self._before, *self._after, *self._last_stages) if running.fault]
+        self.faults_acting: list[Effect] = []  # of `faults`, on the newest sample
         self._every = self.settings.sample_minutes // SAMPLE_MINUTES
         self._states = self._forced_states()
         self._last: float | None = None  # mg/dL, the sample before
@@ -245,6 +253,8 @@ class Sensor:
 
         To be called once for every instant, in order.
         """
+        if self._faults:
+            self.faults_acting = self._acting(step)
         reading = Reading(step, interstitial)
         if self._before:
             self._run(self._before, reading)
@@ -277,6 +287,15 @@ class Sensor:
                 running.effect.act(reading, running.numbers[reading.step], running.memory)
             else:
                 running.memory.held = reading.glucose
+
+    def _acting(self, step: int) -> list[Effect]:
+        """The injected effects that do something to what is sent at this instant, or to the sensor itself."""
+        due = step % self._every == 0 and self.battery(step) > 0
+        return [
+            running.effect
+            for running in self._faults
+            if running.effect.acts(step, running.numbers[step]) and (due or isinstance(running.effect, Replacement))
+        ]
 
     def _show(self, reading: Reading) -> Sample:
         state, glucose = reading.state, reading.glucose

@@ -18,11 +18,12 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
 
 from . import mechanism, physiology
-from .faults import AnyPumpFault
+from .faults import AnyPumpFault, PumpFault
 from .physiology import Patient, Variability
 from .pump import NMT_BOOT_UP, NMT_OPERATIONAL, REPORT, Pump, PumpSettings
 from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
 from .sensor import Sensor, SensorSettings
+from .sensors.effects import Effect
 from .user import User
 
 PMOL_PER_L_PER_MU_PER_L = 6.0
@@ -69,7 +70,7 @@ class Run(NamedTuple):
     calibration: Mapping[int, int]  # CfgIndex -> raw value, the CRC of the set last
     sensor: str | SensorSettings = "coloured"
     variability: tuple[str, ...] = tuple(physiology.SOURCES)
-    faults: tuple[AnyPumpFault, ...] = ()
+    faults: tuple[AnyPumpFault | Effect, ...] = ()  # of the pump, and of the sensor besides its own effects
 
 
 class PlantServer:
@@ -89,7 +90,9 @@ class PlantServer:
         self._without_reading = Batch(self._transmitter, rest)
         self._receiver = Receiver(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
         self._patient = _Body(run)
-        self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name)
+        self._pump_faults = [fault for fault in run.faults if isinstance(fault, PumpFault)]
+        sensor_faults = tuple(fault for fault in run.faults if isinstance(fault, Effect))
+        self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name, sensor_faults)
         self._pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
         self._user = User(run.scenario, run.mode, run.seed, run.patient.name)
         self._outbox: list[Frame] = []
@@ -236,6 +239,7 @@ class PlantServer:
             frames += self._user.announce(self.step, self._patient.rescued, self._transmitter)
         frames += self._pump.report_alarms(self._transmitter)
         reading = self._read_sensor()
+        frames += self._tell_sensor_faults()
         frames += self._sensor_status()
         regular = self._with_reading if reading else self._without_reading
         toggle = self.step & 1
@@ -308,12 +312,23 @@ class PlantServer:
 
     def _fail_on_purpose(self) -> list[Frame]:
         """Let the pump's faults act, and tell."""
+        if not self._pump_faults:
+            return []
         frames = []
-        for fault in self.run.faults:
+        self._pump.insulin.mend()
+        self._pump.pramlintide.mend()
+        for fault in sorted(
+            self._pump_faults, key=lambda fault: fault.active(self.step)
+        ):  # what ends before what begins
             fault.act(self._pump, self.step)
             if fault.active(self.step):
                 frames.append(self._transmitter.frame("FAULT_Inject", **fault.report(self.step)))
         return frames
+
+    def _tell_sensor_faults(self) -> list[Frame]:
+        """What was done to the newest sample on purpose."""
+        faults = self._sensor.faults_acting
+        return [self._transmitter.frame("FAULT_Inject", **fault.report(self.step)) for fault in faults]
 
     def _confirm_pump_alarms(self) -> list[Frame]:
         """The user confirms what the pump has shown since the last step."""

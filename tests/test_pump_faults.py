@@ -10,10 +10,21 @@ from pumpbench.runfolder import RunFolder
 
 from can_bus.faults import Drop
 from can_bus.yaml_file import FileError
-from plant_server.faults import AirBubble, EmptyReservoir, LowBattery, Occlusion
+from plant_server.faults import (
+    AirBubble,
+    DoubleStrokes,
+    EmptyReservoir,
+    LowBattery,
+    MissedStrokes,
+    Occlusion,
+    SlowMotor,
+)
 from plant_server.sensors.effects import Stuck
 
 EVERYTHING = """faults:
+  - {kind: missed_strokes, start: "00:30", end: "01:00"}
+  - {kind: double_strokes, start: "01:00", end: "01:30"}
+  - {kind: slow_motor, start: "01:30", end: "02:00"}
   - {kind: drop, message: CGM_Reading, start: "02:00", end: "02:30"}
   - {kind: occlusion, start: "04:00", end: "09:00", lost: true}
   - {kind: air_bubble, drug: pramlintide, strokes: 12, start: "10:00"}
@@ -28,7 +39,8 @@ def test_a_file_is_sorted_by_where_its_faults_act(tmp_path: Path) -> None:
     file.write_text(EVERYTHING)
     faults = fault_files.load(file)
     assert [type(fault) for fault in faults.wire] == [Drop]
-    assert [type(fault) for fault in faults.pump] == [Occlusion, AirBubble, EmptyReservoir, LowBattery]
+    motor = [MissedStrokes, DoubleStrokes, SlowMotor]
+    assert [type(fault) for fault in faults.pump] == [*motor, Occlusion, AirBubble, EmptyReservoir, LowBattery]
     assert [type(fault) for fault in faults.sensor] == [Stuck]
     fault_files.write_wire(faults, tmp_path / "wire.yaml")
     assert fault_files.load(tmp_path / "wire.yaml") == fault_files.Faults(wire=faults.wire)
@@ -84,6 +96,7 @@ def test_all_of_them_in_one_run_on_hub_and_inproc(pumpbench: Pumpbench, runs: Pa
     kinds = [event.kind for event in trace.faults]
     assert kinds.count("Occlusion") == 60  # told in every step it lasts
     assert {"Drop", "AirBubble", "EmptyReservoir", "LowBattery"} <= set(kinds)
+    assert [kinds.count(kind) for kind in ("MissedStrokes", "DoubleStrokes", "SlowMotor", "SensorStuck")] == [6] * 4
     glucose = trace.get("GlucoseConc")
     assert len(set(glucose[133:138])) == 1  # stuck
     assert trace.get("PumpState")[-2] == 5  # the battery ran out

@@ -6,6 +6,9 @@ electrode's, the transmitter's and the radio's; several of one kind act in the o
 number per sampling instant of the whole run in advance, from a stream of their own named by kind and `name`: moving a
 window, or switching another effect off, shifts nothing.
 
+A sensor has its effects by itself (`SensorSettings.effects`), or somebody injects them as faults; the plant tells of
+the latter alone, with FAULT_Inject, at every instant at which they act.
+
 Magnitudes are parameters; where a default is from a source it is named, the others are chosen for this project.
 """
 
@@ -14,12 +17,13 @@ import math
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from can_bus import codec
 from can_bus.faults import Time
 from can_bus.lockstep import STEP_SECONDS
 
+from ..injected import Injected
 from .model import INSTANTS_PER_DAY, SAMPLE_MINUTES, Array
 
 STATE_OK, STATE_BELOW_RANGE, STATE_ABOVE_RANGE = 1, 4, 5
@@ -68,10 +72,11 @@ class Memory:
         self.held: float | None = None  # mg/dL; before the window, what went past
 
 
-class Effect(BaseModel):
+class Effect(Injected):
     """Something that acts from `start` until before `end`, or to the end of the run; "hh:mm" or "days+hh:mm"."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    NODE: ClassVar[str] = "CGM"
+    MESSAGE: ClassVar[str | None] = "CGM_Reading"
 
     stage: ClassVar[Stage]
     bit: ClassVar[int] = 0
@@ -101,6 +106,10 @@ class Effect(BaseModel):
         """One number for every instant of the run; what it means is the effect's own affair."""
         return np.zeros(count)
 
+    def acts(self, step: int, number: float) -> bool:
+        """Whether it changes anything at this sampling instant, with its number there."""
+        return self.active(step)
+
     def act(self, reading: Reading, number: float, memory: Memory) -> None:
         """Change the reading of one instant within the window."""
         raise NotImplementedError
@@ -109,7 +118,11 @@ class Effect(BaseModel):
 class Lag(Effect):
     """A first-order delay of the sensor, on top of the interstitial fluid's: minutes is its time constant."""
 
+    CODE: ClassVar[int] = 40
     stage: ClassVar[Stage] = Stage.TISSUE
+    HAZARDS = ("H2",)
+    UNSEEN = "a delay looks like glucose that changes slowly"
+    EXAMPLES = ({"start": "01:00", "end": "04:00", "minutes": 20},)
 
     kind: Literal["lag"] = "lag"
     minutes: Annotated[float, Field(gt=0, le=120)] = 5.0
@@ -130,9 +143,15 @@ class CompressionLow(Effect):
     dips per day in 15 subjects.
     """
 
+    CODE: ClassVar[int] = 41
     stage: ClassVar[Stage] = Stage.TISSUE
     bit: ClassVar[int] = FaultBit.COMPRESSION
     random: ClassVar[bool] = True
+    HAZARDS = ("H3", "H4")
+    UNSEEN = (
+        "a dip with ramps is as steep as glucose can be; only where it comes on top of a fall does the device doubt it"
+    )
+    EXAMPLES = ({"start": "02:00", "end": "03:00"},)
 
     kind: Literal["compression_low"] = "compression_low"
     depth: Annotated[float, Field(gt=0, le=1)] = 0.4
@@ -166,6 +185,10 @@ class CompressionLow(Effect):
     def _shape(self, since: Array, left: Array) -> Array:
         return np.minimum(1.0, np.minimum(since + SAMPLE_MINUTES, left) / self.ramp_minutes)
 
+    def acts(self, step: int, number: float) -> bool:
+        """In the episode, or in one of those at random."""
+        return self.active(step) and (self.per_day is None or number > 0)
+
     def act(self, reading: Reading, number: float, memory: Memory) -> None:
         """Press."""
         if self.per_day is None:
@@ -180,8 +203,12 @@ class CompressionLow(Effect):
 class Bias(Effect):
     """A wrong calibration: gain * reading + offset (mg/dL)."""
 
+    CODE: ClassVar[int] = 42
     stage: ClassVar[Stage] = Stage.ELECTRODE
     bit: ClassVar[int] = FaultBit.CALIBRATION
+    HAZARDS = ("H2",)
+    UNSEEN = "a calibration error within the plausible range looks like glucose"
+    EXAMPLES = ({"start": "01:00", "end": "04:00", "gain": 1.2}, {"start": "01:00", "end": "04:00", "offset": -20})
 
     kind: Literal["bias"] = "bias"
     gain: Annotated[float, Field(ge=0, le=10)] = 1.0
@@ -197,8 +224,12 @@ class Bias(Effect):
 class Drift(Effect):
     """An error that grows with the time since `start`: offset_per_hour in mg/dL, gain_per_hour as a share of 1."""
 
+    CODE: ClassVar[int] = 43
     stage: ClassVar[Stage] = Stage.ELECTRODE
     bit: ClassVar[int] = FaultBit.CALIBRATION
+    HAZARDS = ("H2",)
+    UNSEEN = "an error that grows more slowly than glucose changes looks like glucose"
+    EXAMPLES = ({"start": "01:00", "end": "04:00", "offset_per_hour": 15},)
 
     kind: Literal["drift"] = "drift"
     offset_per_hour: Annotated[float, Field(ge=-400, le=400)] = 0.0
@@ -215,9 +246,13 @@ class Drift(Effect):
 class Noise(Effect):
     """More noise, of standard deviation `sd` (mg/dL); `correlation` is that of one 5-min sample with the next."""
 
+    CODE: ClassVar[int] = 44
     stage: ClassVar[Stage] = Stage.ELECTRODE
     bit: ClassVar[int] = FaultBit.NOISE
     random: ClassVar[bool] = True
+    HAZARDS = ("H3",)
+    SEEN_BY = ("CgmImplausible",)
+    EXAMPLES = ({"start": "01:00", "end": "04:00", "sd": 25},)
 
     kind: Literal["noise"] = "noise"
     sd: Annotated[float, Field(gt=0, le=200)] = 15.0
@@ -244,7 +279,11 @@ class Noise(Effect):
 class Stuck(Effect):
     """The number stands still, on `value` (mg/dL) or on the last one before; numbering and sending go on."""
 
+    CODE: ClassVar[int] = 45
     stage: ClassVar[Stage] = Stage.TRANSMITTER
+    HAZARDS = ("H3", "H4", "H7")
+    SEEN_BY = ("CgmLost", "CgmImplausible")
+    EXAMPLES = ({"start": "01:00", "end": "04:00"}, {"start": "01:00", "end": "04:00", "value": 110})
 
     kind: Literal["stuck"] = "stuck"
     value: Annotated[float, Field(ge=0, le=800)] | None = None
@@ -259,7 +298,11 @@ class Stuck(Effect):
 class State(Effect):
     """The sensor says that it has no reading, and why; the number is SNA."""
 
+    CODE: ClassVar[int] = 46
     stage: ClassVar[Stage] = Stage.STATE
+    HAZARDS = ("H3", "H4")
+    SEEN_BY = ("CgmLost", "CgmImplausible")
+    EXAMPLES = ({"start": "02:00", "end": "03:00"}, {"start": "02:00", "end": "04:00", "state": "Warmup"})
 
     kind: Literal["state"] = "state"
     state: Literal["Warmup", "CalibrationNeeded", "TempInvalid", "SensorFault", "Expired"] = "SensorFault"
@@ -275,9 +318,13 @@ class DropOut(Effect):
     What is lost stays lost, its number (CgmSampleSeq) is left out, and CgmDropCount counts it.
     """
 
+    CODE: ClassVar[int] = 47
     stage: ClassVar[Stage] = Stage.RADIO
     bit: ClassVar[int] = FaultBit.TELEMETRY
     random: ClassVar[bool] = True
+    HAZARDS = ("H3", "H4", "H7")
+    SEEN_BY = ("CgmLost", "LostFrameCount")
+    EXAMPLES = ({"start": "02:00", "end": "03:00"}, {"start": "01:00", "end": "04:00", "probability": 0.5})
 
     kind: Literal["drop_out"] = "drop_out"
     probability: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -297,6 +344,10 @@ class DropOut(Effect):
             lost.append(float(last))
         return np.array(lost)
 
+    def acts(self, step: int, number: float) -> bool:
+        """Where a sample is lost."""
+        return self.active(step) and number > 0
+
     def act(self, reading: Reading, number: float, memory: Memory) -> None:
         """Lose it."""
         if number > 0:
@@ -307,10 +358,23 @@ class DropOut(Effect):
 class Replacement(Effect):
     """A new sensor is inserted at `start`: a new session, a new age, a new draw of a model that has one per sensor."""
 
+    CODE: ClassVar[int] = 48
     stage: ClassVar[Stage] = Stage.STATE
+    HAZARDS = ("H3",)
+    UNSEEN = "nothing is wrong: CGM_Status tells of a new session, and the device trusts no trend for a while"
+    EXAMPLES = ({"start": "02:00"},)
 
     kind: Literal["replacement"] = "replacement"
     end: None = None
+
+    @property
+    def first_step(self) -> int:
+        """The sampling instant at which the new sensor is there."""
+        return -(-self.start // STEP_SECONDS)
+
+    def acts(self, step: int, number: float) -> bool:
+        """Once."""
+        return step == self.first_step
 
     def act(self, reading: Reading, number: float, memory: Memory) -> None:
         """Nothing: the sensor's wear knows of it."""
