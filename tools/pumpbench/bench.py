@@ -250,7 +250,7 @@ class Outcome:
         lines += [
             (int(event.time_s), 2, f"{event.node} raises {event.code} ({event.priority})") for event in self.raised()
         ]
-        lines += [(time, 3, f"CTRL is {name}") for time, name in self.states()[1:]]
+        lines += [(time, 3, f"CTRL is {name}") for time, name in self.states() if time > STEP_SECONDS]
         lines.sort()
         shown = [f"{clock(time)}  {text}" for time, _, text in lines[:limit]]
         shown += [f"... and {len(lines) - limit} more"] if len(lines) > limit else []
