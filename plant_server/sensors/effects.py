@@ -149,7 +149,8 @@ class CompressionLow(Effect):
     random: ClassVar[bool] = True
     HAZARDS = ("H3", "H4")
     UNSEEN = (
-        "a dip with ramps is as steep as glucose can be; only where it comes on top of a fall does the device doubt it"
+        "a dip with ramps is no steeper than glucose can be: the device may withhold insulin as for a low, "
+        "but it does not doubt the number"
     )
     EXAMPLES = ({"start": "02:00", "end": "03:00"},)
 
