@@ -17,6 +17,7 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Done, Phase, Turn
 
 from .alarms import Alarms, Code
+from .balance import Balance
 from .bolus import Boluses, Drug
 from .calibration import Calibration
 from .cgm import Cgm
@@ -57,6 +58,9 @@ COMMANDING = (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN)
 
 ALARM_HOLD = 3
 """Quiet steps after which the alarm of a passing error ends (project's choice)."""
+
+UNBALANCED_INSULIN, UNBALANCED_PRAM = 500, 500
+"""Ten strokes, in mU and in 0.01 ug (project's choice)."""
 
 NMT_BOOT_UP, NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 0, 5, 127
 
@@ -161,6 +165,7 @@ class Firmware:
         self._pump = Pump()
         self._boluses = Boluses()
         self._meals = Meals()
+        self._balances = {Drug.INSULIN: Balance(UNBALANCED_INSULIN), Drug.PRAMLINTIDE: Balance(UNBALANCED_PRAM)}
         self._insulin_day = Day()
         self._pram_day = Day()
         self._ladder = Ladder()
@@ -173,6 +178,7 @@ class Firmware:
         self._step: int | None = None
         self._samples: list[dict[str, int]] = []
         self._totals: dict[str, int] | None = None
+        self._totals_known = False  # in the step before
         self._status: dict[str, int] | None = None
         self._bolus_states: set[int] = set()  # drugs heard of in this step
         self._rejected = False
@@ -484,13 +490,28 @@ class Firmware:
         self._bolus_states.clear()
         pramlintide = self._pump.pramlintide(self._totals)
         basal = self._calibration.parameters[layout.BASAL]
-        bolus = sum(raw * 10 for drug, raw in self._boluses.open_step(step) if drug == Drug.INSULIN)
+        told = self._boluses.open_step(step)
+        bolus, pram_bolus = (sum(raw * 10 for drug, raw in told if drug == wanted) for wanted in Drug)
         delivered = self._pump.delivered(self._totals, step, basal, bolus)
+        self._balance(basal, {Drug.INSULIN: (bolus, delivered), Drug.PRAMLINTIDE: (pram_bolus, pramlintide)})
         self._status = None
         self._totals = None
         self._insulin_day.add(max(delivered, 0), step)
         self._pram_day.add(pramlintide, step)
         return delivered, bolus
+
+    def _balance(self, basal: int, of: dict[Drug, tuple[int, int]]) -> None:
+        """Hold what the totals grew by against what was asked for; over a gap nobody knows what that was."""
+        known = self._totals is not None and self._skipped == 0 and of[Drug.INSULIN][1] >= 0
+        for (drug, (bolus, delivered)), rate in zip(of.items(), self._pump.asked(basal), strict=True):
+            if known and self._totals_known:
+                self._balances[drug].account(rate, bolus, delivered)
+            else:
+                self._balances[drug].reset()
+        self._totals_known = known
+
+    def _unbalanced(self) -> bool:
+        return any(balance.off(self._boluses.remaining(drug) * 10) for drug, balance in self._balances.items())
 
     def _control(self, state: State, glucose: int, delivered: int, bolus: int) -> None:
         inputs = self._inputs
@@ -586,7 +607,8 @@ class Firmware:
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_REJECTED, step - self._last_rejected < ALARM_HOLD, step)
         alarms.hold(Code.PUMP_LOST, state == State.DELIVERY_UNCERTAIN and not self._boluses.uncertain, step)
-        alarms.hold(Code.DELIVERY_UNCERTAIN, self._boluses.uncertain or self._pump.unlike, step)
+        amiss = self._boluses.uncertain or self._pump.unlike or self._unbalanced()
+        alarms.hold(Code.DELIVERY_UNCERTAIN, amiss, step)
         alarms.hold(Code.URGENT_LOW, self._urgent, step)
         alarms.hold(Code.CLOCK_JUMP, step - self._last_jump < ALARM_HOLD, step)
         alarms.hold(Code.NODE_RESET, step - self._last_reset < ALARM_HOLD, self._boots)

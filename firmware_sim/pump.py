@@ -75,6 +75,15 @@ class Pump:
         self.unanswered = 0  # answers to set-points that never came
         self.misunderstood = 0  # set-points that the pump took for others
 
+    def asked(self, basal: int) -> tuple[int, int]:
+        """Rates in force by the last set-point: insulin in 0.001 U/h, pramlintide in 0.01 ug/h.
+
+        Args:
+            basal: scheduled rate in 0.001 U/h, where the pump was left to its schedule.
+        """
+        insulin = basal if self._commanded_rate is None else self._commanded_rate * 5
+        return insulin, 0 if self._rates is None else self._rates[1] * 10
+
     def age(self, step: int) -> int:
         """Steps since status, totals and the states of boluses were last heard; of these, those ever heard."""
         return step - min(self._status_step, self._totals_step, *self._bolus_steps.values())

@@ -78,9 +78,6 @@ class Occlusion(LastingPumpFault):
     """
 
     CODE: ClassVar[int] = 18
-    HAZARDS = ("H6", "H7")
-    SEEN_BY = ("Occlusion",)
-    EXAMPLES = ({"start": "01:00", "end": "04:00"}, {"start": "01:00", "end": "04:00", "lost": True})
 
     kind: Literal["occlusion"] = "occlusion"
     drug: Drug = "insulin"
@@ -98,12 +95,6 @@ class AirBubble(PumpFault):
     """The next strokes move air: they are made and lost."""
 
     CODE: ClassVar[int] = 19
-    HAZARDS = ("H6",)
-    UNSEEN = (
-        "the motor moves as it should and the line's sensor measures pressure, not air; the device reckons "
-        "with what the pump's totals say and does not ask why it is less than it asked for"
-    )
-    EXAMPLES = ({"start": "02:00"},)
 
     kind: Literal["air_bubble"] = "air_bubble"
     drug: Drug = "insulin"
@@ -119,9 +110,6 @@ class EmptyReservoir(PumpFault):
     """The reservoir is empty until the user changes it."""
 
     CODE: ClassVar[int] = 20
-    HAZARDS = ("H6", "H7")
-    SEEN_BY = ("ReservoirEmpty",)
-    EXAMPLES = ({"start": "02:00"}, {"start": "02:00", "drug": "pramlintide"})
 
     kind: Literal["empty_reservoir"] = "empty_reservoir"
     drug: Drug = "insulin"
@@ -136,9 +124,6 @@ class LowBattery(PumpFault):
     """The battery falls to `percent`; at 0 the pump stops."""
 
     CODE: ClassVar[int] = 21
-    HAZARDS = ("H6", "H7")
-    SEEN_BY = ("BatteryLow", "BatteryEmpty")
-    EXAMPLES = ({"start": "02:00"}, {"start": "02:00", "percent": 0})
 
     kind: Literal["low_battery"] = "low_battery"
     percent: Annotated[float, Field(ge=0, le=100)] = 15.0
@@ -156,15 +141,6 @@ class MissedStrokes(LastingPumpFault):
     """
 
     CODE: ClassVar[int] = 22
-    HAZARDS = ("H6", "H7")
-    UNSEEN = (
-        "the device reckons with what the pump's totals say and does not ask why it is less than it asked "
-        "for, nor why a bolus was not finished"
-    )
-    EXAMPLES = (
-        {"start": "01:00", "end": "04:00"},
-        {"start": "01:00", "end": "04:00", "drug": "pramlintide", "every": 3},
-    )
 
     kind: Literal["missed_strokes"] = "missed_strokes"
     drug: Drug = "insulin"
@@ -189,12 +165,6 @@ class DoubleStrokes(LastingPumpFault):
     """
 
     CODE: ClassVar[int] = 23
-    HAZARDS = ("H1", "H2", "H6")
-    UNSEEN = "the device reckons with what the pump's totals say and does not ask why it is more than it asked for"
-    EXAMPLES = (
-        {"start": "01:00", "end": "04:00"},
-        {"start": "01:00", "end": "04:00", "drug": "pramlintide", "every": 3},
-    )
 
     kind: Literal["double_strokes"] = "double_strokes"
     drug: Drug = "insulin"
@@ -213,9 +183,6 @@ class SlowMotor(LastingPumpFault):
     """The motor makes at most so many strokes per 30 s (a sound one 15); the others are pending and made later."""
 
     CODE: ClassVar[int] = 24
-    HAZARDS = ("H1", "H5", "H6")
-    UNSEEN = "the strokes are late and not lost, and the device sets no time within which a bolus has to be done"
-    EXAMPLES = ({"start": "01:00", "end": "04:00"},)
 
     kind: Literal["slow_motor"] = "slow_motor"
     drug: Drug = "insulin"

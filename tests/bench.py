@@ -135,8 +135,10 @@ class Bench:
         self.log: list[Frame] = []  # everything on the bus, both directions, in order
         self.k = 0  # the next step
         self.total = 0  # 1/12 mU delivered
+        self.pram_total = 0  # 1/12 of 0.01 ug
         self.boot_count = 0
         self._rate = self.basal  # 0.001 U/h, what the pump is doing
+        self._pram_rate = 0  # 0.01 ug/h
         self._calls = 0
         self._roll = Transmitter()
         self.transmitter = Transmitter()
@@ -240,7 +242,8 @@ class Bench:
 
     def delivered(self, **values: int) -> Frame:
         """PUMP_Delivered of the step to come, or with fields of one's own."""
-        fields = {"PumpBootCount": self.boot_count, "InsulinTotal": self.total // 12, "PramTotal": 0}
+        totals = {"InsulinTotal": self.total // 12, "PramTotal": self.pram_total // 12}
+        fields = {"PumpBootCount": self.boot_count, **totals}
         return self.frame("PUMP_Delivered", **(fields | values))
 
     def step(
@@ -280,7 +283,9 @@ class Bench:
         for command in turn.all("PUMP_BasalCmd"):
             rates = {Op.SET_RATE: command["InsulinRate"] * 5, Op.SUSPEND: 0, Op.RESUME_SCHEDULE: self.basal}
             self._rate = rates[Op(command["BasalOp"])]
+            self._pram_rate = command["PramlintideRate"] * 10 if command["BasalOp"] == Op.SET_RATE else 0
         self.total += self._rate
+        self.pram_total += self._pram_rate
 
     def run(self, steps: int, glucose: int = GLUCOSE) -> Turn:
         """Several undisturbed steps; the last one's turn."""

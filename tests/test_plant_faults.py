@@ -1,6 +1,5 @@
 """Faults of the pump's motor and of the sensor: counted in strokes, told on the bus, and who sees them."""
 
-import functools
 from pathlib import Path
 from typing import Any, get_args
 
@@ -11,8 +10,8 @@ from hypothesis import strategies as st
 from pumpbench import bench, rig
 from pumpbench import faults as fault_files
 from pumpbench.capture import Capture
+from pumpbench.catalogue import entries
 from pumpbench.faults import Faults
-from pumpbench.probe import Probe, judge
 from pumpbench.trace import labels
 
 from can_bus.yaml_file import FileError
@@ -38,7 +37,7 @@ from plant_server.sensors.effects import EFFECTS, CompressionLow, DropOut, Effec
 from plant_server.server import PlantServer
 
 KINDS: tuple[type[Injected], ...] = (*get_args(AnyPumpFault), *EFFECTS.values())
-EXAMPLES = [example for kind in KINDS for example in kind.examples()]
+EXAMPLES = [entry.fault for entry in entries() if type(entry.fault) in KINDS]
 EVERY = st.integers(1, 7)
 
 
@@ -349,41 +348,6 @@ def test_an_empty_battery_has_no_sample_to_lose() -> None:
     device = Sensor(settings, 200, 1, "adult#001", (DropOut(),))
     acted = [step for step in range(200) if device.sample(step, 120.0) is None and device.faults_acting]
     assert acted == list(range(144))
-
-
-# ---- the catalogue
-
-
-ALARMS = {
-    *labels("CTRL_Alarm", "CtrlAlarmCode").values(),
-    *labels("PUMP_Alarm", "PumpAlarmCode").values(),
-}
-COUNTERS = {"LostFrameCount", "E2eErrorCount", "SequenceErrorCount", "SaturationCount"}
-
-
-@functools.cache
-def signs(fault: Any) -> list[set[str]]:
-    """What shows in runs with this fault and not in the same without, run by run."""
-    probes = [Probe(f"adult#{seed:03d}", mode, seed, faults=(fault,)) for mode in ("ma", "s2") for seed in (1, 3)]
-    verdicts = [judge(probe) for probe in probes]
-    assert all(not verdict.failed and verdict.injected for verdict in verdicts)
-    return [{sign.split(".")[-1] for sign in verdict.signs} for verdict in verdicts]
-
-
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_the_catalogue_tells_the_truth(kind: Any) -> None:
-    examples = kind.examples()
-    assert 1 <= len(examples) <= 2
-    assert all(3600 <= each.start < (getattr(each, "end", None) or 4 * 3600) <= 4 * 3600 for each in examples)
-    assert kind.HAZARDS
-    assert set(kind.HAZARDS) <= {f"H{number}" for number in range(1, 9)}
-    assert bool(kind.SEEN_BY) != bool(kind.UNSEEN)
-    assert set(kind.SEEN_BY) <= ALARMS | COUNTERS
-    always = [set.intersection(*signs(example)) for example in examples]
-    assert all(each & set(kind.SEEN_BY) for each in always) or kind.UNSEEN
-    assert set(kind.SEEN_BY) <= set.union(*always)
-    if kind.UNSEEN:
-        assert not any(set.union(*signs(example)) for example in examples)
 
 
 # ---- files

@@ -120,9 +120,6 @@ class Lag(Effect):
 
     CODE: ClassVar[int] = 40
     stage: ClassVar[Stage] = Stage.TISSUE
-    HAZARDS = ("H2",)
-    UNSEEN = "a delay looks like glucose that changes slowly"
-    EXAMPLES = ({"start": "01:00", "end": "04:00", "minutes": 20},)
 
     kind: Literal["lag"] = "lag"
     minutes: Annotated[float, Field(gt=0, le=120)] = 5.0
@@ -147,12 +144,6 @@ class CompressionLow(Effect):
     stage: ClassVar[Stage] = Stage.TISSUE
     bit: ClassVar[int] = FaultBit.COMPRESSION
     random: ClassVar[bool] = True
-    HAZARDS = ("H3", "H4")
-    UNSEEN = (
-        "a dip with ramps is no steeper than glucose can be: the device may withhold insulin as for a low, "
-        "but it does not doubt the number"
-    )
-    EXAMPLES = ({"start": "02:00", "end": "03:00"},)
 
     kind: Literal["compression_low"] = "compression_low"
     depth: Annotated[float, Field(gt=0, le=1)] = 0.4
@@ -207,9 +198,6 @@ class Bias(Effect):
     CODE: ClassVar[int] = 42
     stage: ClassVar[Stage] = Stage.ELECTRODE
     bit: ClassVar[int] = FaultBit.CALIBRATION
-    HAZARDS = ("H2",)
-    UNSEEN = "a calibration error within the plausible range looks like glucose"
-    EXAMPLES = ({"start": "01:00", "end": "04:00", "gain": 1.2}, {"start": "01:00", "end": "04:00", "offset": -20})
 
     kind: Literal["bias"] = "bias"
     gain: Annotated[float, Field(ge=0, le=10)] = 1.0
@@ -228,9 +216,6 @@ class Drift(Effect):
     CODE: ClassVar[int] = 43
     stage: ClassVar[Stage] = Stage.ELECTRODE
     bit: ClassVar[int] = FaultBit.CALIBRATION
-    HAZARDS = ("H2",)
-    UNSEEN = "an error that grows more slowly than glucose changes looks like glucose"
-    EXAMPLES = ({"start": "01:00", "end": "04:00", "offset_per_hour": 15},)
 
     kind: Literal["drift"] = "drift"
     offset_per_hour: Annotated[float, Field(ge=-400, le=400)] = 0.0
@@ -251,9 +236,6 @@ class Noise(Effect):
     stage: ClassVar[Stage] = Stage.ELECTRODE
     bit: ClassVar[int] = FaultBit.NOISE
     random: ClassVar[bool] = True
-    HAZARDS = ("H3",)
-    SEEN_BY = ("CgmImplausible",)
-    EXAMPLES = ({"start": "01:00", "end": "04:00", "sd": 25},)
 
     kind: Literal["noise"] = "noise"
     sd: Annotated[float, Field(gt=0, le=200)] = 15.0
@@ -282,9 +264,6 @@ class Stuck(Effect):
 
     CODE: ClassVar[int] = 45
     stage: ClassVar[Stage] = Stage.TRANSMITTER
-    HAZARDS = ("H3", "H4", "H7")
-    SEEN_BY = ("CgmLost", "CgmImplausible")
-    EXAMPLES = ({"start": "01:00", "end": "04:00"}, {"start": "01:00", "end": "04:00", "value": 110})
 
     kind: Literal["stuck"] = "stuck"
     value: Annotated[float, Field(ge=0, le=800)] | None = None
@@ -301,9 +280,6 @@ class State(Effect):
 
     CODE: ClassVar[int] = 46
     stage: ClassVar[Stage] = Stage.STATE
-    HAZARDS = ("H3", "H4")
-    SEEN_BY = ("CgmLost", "CgmImplausible")
-    EXAMPLES = ({"start": "02:00", "end": "03:00"}, {"start": "02:00", "end": "04:00", "state": "Warmup"})
 
     kind: Literal["state"] = "state"
     state: Literal["Warmup", "CalibrationNeeded", "TempInvalid", "SensorFault", "Expired"] = "SensorFault"
@@ -323,9 +299,6 @@ class DropOut(Effect):
     stage: ClassVar[Stage] = Stage.RADIO
     bit: ClassVar[int] = FaultBit.TELEMETRY
     random: ClassVar[bool] = True
-    HAZARDS = ("H3", "H4", "H7")
-    SEEN_BY = ("CgmLost", "LostFrameCount")
-    EXAMPLES = ({"start": "02:00", "end": "03:00"}, {"start": "01:00", "end": "04:00", "probability": 0.5})
 
     kind: Literal["drop_out"] = "drop_out"
     probability: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -361,9 +334,6 @@ class Replacement(Effect):
 
     CODE: ClassVar[int] = 48
     stage: ClassVar[Stage] = Stage.STATE
-    HAZARDS = ("H3",)
-    UNSEEN = "nothing is wrong: CGM_Status tells of a new session, and the device trusts no trend for a while"
-    EXAMPLES = ({"start": "02:00"},)
 
     kind: Literal["replacement"] = "replacement"
     end: None = None

@@ -70,11 +70,14 @@ def matrix(
     wrong = [cell for cell in cells if cell.wrong]
     for cell in wrong[:20]:
         errors.print(f"{cell.entry.name}, mode {cell.mode}, seed {cell.seed}: {cell.wrong}", markup=False)
+    outdated = matrices.outdated(cells)
+    for name, signs in outdated.items():
+        errors.print(f"{name}: seen in every run, by {', '.join(sorted(signs))}: the catalogue says nothing is")
     if markdown is not None:
         write_file(markdown, matrices.page(cells).encode())
     console.print(f"{len(cells)} runs, {len(wrong)} of them wrong")
-    if wrong:
-        raise Failed(EXIT_WRONG, f"{len(wrong)} of {len(cells)} runs were wrong")
+    if wrong or outdated:
+        raise Failed(EXIT_WRONG, f"{len(wrong)} of {len(cells)} runs and {len(outdated)} reasons were wrong")
 
 
 def hunt(

@@ -35,8 +35,6 @@ class Cell(NamedTuple):
             return f"hazards {verdict.hazards}, the first in step {verdict.first[0]}" if verdict.first else "hazards"
         if self.missed:
             return f"not seen: {', '.join(self.missed)}; found {', '.join(sorted(verdict.signs)) or 'nothing'}"
-        if verdict.signs and self.entry.unseen:
-            return f"seen after all: {', '.join(sorted(verdict.signs))}"
         return ""
 
 
@@ -68,6 +66,17 @@ def run(
     ]
     verdicts = probe.in_parallel(probe.judge, probes, jobs, lambda done: told(done, len(probes)))
     return [Cell(*place, verdict) for place, verdict in zip(places, verdicts, strict=True)]
+
+
+def outdated(cells: Sequence[Cell]) -> dict[str, set[str]]:
+    """Entries that nothing is said to show, and the signs that show them in every run all the same."""
+    found = {}
+    for entry in {cell.entry.name: cell.entry for cell in cells}.values():
+        signs = [cell.verdict.signs for cell in cells if cell.entry.name == entry.name and cell.verdict.injected]
+        always = set.intersection(*map(set, signs)) if signs and entry.unseen else set()
+        if always:
+            found[entry.name] = always
+    return found
 
 
 def table(cells: Sequence[Cell]) -> str:
