@@ -29,6 +29,9 @@ SHRINK_AT_MOST = 150
 
 FAULTS_AT_MOST = 4
 
+ENDLESS = ("kill", "restart", "replacement")
+"""Kinds that are drawn without an end."""
+
 SCENARIOS = (("six-hours", 6.0), ("six-hours", 6.0), ("validation-14d", 24.0), ("camerlingo", 24.0))
 """And hours; the short one as often as both days together."""
 
@@ -89,7 +92,7 @@ def _draw(rng: random.Random, hours: float) -> Any:
         begin = rng.randrange(1, round(hours * 12))  # steps; the first one belongs to the start of the run
         length = rng.choice((1, 2, 3, 4, 6, 8, 12, 24, 48))
         keys = {"kind": kind, "start": clock(begin * STEP_SECONDS), **_KEYS.get(kind, _frame_keys)(rng)}
-        if "end" in make.KINDS[kind].model_fields and kind not in ("kill", "restart"):
+        if "end" in make.KINDS[kind].model_fields and kind not in ENDLESS:
             keys["end"] = clock((begin + length) * STEP_SECONDS)
         try:
             return _ADAPTER.validate_python(keys)
@@ -220,9 +223,9 @@ def _smaller(probe: Probe, verdict: Verdict) -> Iterator[Probe]:
         if len(probe.faults) > 1:
             yield probe._replace(faults=probe.faults[:index] + probe.faults[index + 1 :])
     if verdict.first is not None:
-        hours = max((verdict.first[0] + 2) / 12, 1.0)
+        hours = max(round((verdict.first[0] + 2) / 12, 2), 1.0)
         if hours < probe.hours:
-            yield probe._replace(hours=round(hours, 2))
+            yield probe._replace(hours=hours)
     if probe.hours > 1:
         yield probe._replace(hours=max(round(probe.hours / 2, 2), 1.0))
     for index, fault in enumerate(probe.faults):
