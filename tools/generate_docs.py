@@ -16,6 +16,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pumpbench import catalogue
+from pumpbench.faults import KINDS, dump
+
 import dbc
 from can_bus import codec, hub_wire, lockstep
 from can_bus.codec import MAX_LOST
@@ -385,7 +388,38 @@ def _word(word: layout.Word) -> Sequence[str]:
 
 # ---- command line
 
-PAGES: dict[str, Callable[[], str]] = {"docs/protocol.md": protocol, "docs/numbers.md": numbers}
+# ---- docs/faults.md
+
+
+def faults() -> str:
+    """The catalogue of faults: kinds, their keys, and typical ones with who notices."""
+    return page(
+        "the kinds of faults, tools/pumpbench/catalogue.yaml and docs/_faults_intro.md",
+        fill("_faults_intro.md", {"kinds": "\n\n".join(_kind(kind) for kind in KINDS)}),
+    )
+
+
+def _kind(kind: str) -> str:
+    shared = {"start", "end", "message", "when", "nth", "every", "probability", "seed", "count"}
+    own = [f"`{name}`: {text}" for name, text in catalogue.parameters(kind).items() if name not in shared]
+    rows = [
+        (entry.name, f"`{as_flow(entry.fault)}`", ", ".join(entry.hazards), entry.noticed)
+        for entry in catalogue.examples(kind)
+    ]
+    parts = [f"### {kind}", catalogue.describe(kind), *(["; ".join(own) + "."] if own else [])]
+    return "\n\n".join([*parts, table(("example", "in a file", "puts to the test", "noticed"), rows)])
+
+
+def as_flow(fault: Any) -> str:
+    """A fault as one line of a file, without its dash."""
+    return dump([fault]).splitlines()[1].removeprefix("  - ")
+
+
+PAGES: dict[str, Callable[[], str]] = {
+    "docs/protocol.md": protocol,
+    "docs/numbers.md": numbers,
+    "docs/faults.md": faults,
+}
 """Path within the repository -> what writes it."""
 
 
