@@ -27,9 +27,10 @@ test: setup      ## linters, then all tests: on the embedded bus here, on a real
 coverage: setup  ## lines and branches of the firmware that no test runs: none may be left
 	$(BIN)/python -m pytest -m "not vcan" -n logical --dist loadfile --cov --cov-report=term-missing
 
-nightly: setup   ## the long tests: 10000 hostile sequences, a million random frames, oracle and compiled loop in all pairs
-	PUMPBENCH_NIGHTLY=1 PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 \
-	  $(BIN)/python -m pytest --timeout 3600 -n logical tests/test_hostile.py tests/test_float_oracle.py tests/test_compiled_loop.py
+nightly: setup   ## the long tests: hostile sequences, random frames, oracle and compiled loop, matrix, hunt and kills in full
+	PUMPBENCH_NIGHTLY=1 PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 PUMPBENCH_KILLS=1000 \
+	  $(BIN)/python -m pytest --timeout 5400 -n logical --dist loadfile tests/test_hostile.py tests/test_float_oracle.py \
+	  tests/test_compiled_loop.py tests/test_catalogue.py tests/test_hunt.py tests/test_kills.py
 
 mutation: setup  ## mutation score of the dosing, limits, protocol and memory modules (about an hour)
 	$(BIN)/mutmut run

@@ -10,6 +10,10 @@ from pumpbench.catalogue import Entry, entries
 from pumpbench.probe import Probe, Verdict
 
 
+RUNS_TO_TELL = 7
+"""Runs of an entry from which on what shows in all of them is no chance."""
+
+
 class Cell(NamedTuple):
     """One run of the matrix."""
 
@@ -73,7 +77,7 @@ def outdated(cells: Sequence[Cell]) -> dict[str, set[str]]:
     found = {}
     for entry in {cell.entry.name: cell.entry for cell in cells}.values():
         signs = [cell.verdict.signs for cell in cells if cell.entry.name == entry.name and cell.verdict.injected]
-        always = set.intersection(*map(set, signs)) if signs and entry.unseen else set()
+        always = set.intersection(*map(set, signs)) if len(signs) >= RUNS_TO_TELL and entry.unseen else set()
         if always:
             found[entry.name] = always
     return found
