@@ -3,6 +3,7 @@
 #include <string.h>
 
 #define STEP_SECONDS 300
+#define STEPS_PER_HOUR 12
 #define NEVER (-(1 << 20)) /* a step long before the first one */
 #define SCHEDULE (-1)      /* in place of a commanded rate */
 
@@ -191,6 +192,7 @@ static int32_t judge_sensor(struct supervisor *supervisor, int32_t step, int32_t
 #define RATE_EXPIRES_AFTER 3 /* steps a set-point may run without a newer one */
 #define SEQUENCES_BASAL 1023 /* BasalCmdSeq runs from 0 to 1022 */
 #define UNLIKE_STEPS 2u      /* steps with another set-point than the last one until the alarm (requirement CMD-09) */
+#define UNBALANCED 500       /* mU, and 0.01 ug: ten strokes */
 #define AWAIT_INSULIN 1u
 #define AWAIT_PRAM 2u
 
@@ -297,9 +299,49 @@ static int32_t delivered(struct pump *pump, int32_t step, int32_t basal)
         return -1;
     }
     const int32_t milliunits = pump->commanded == SCHEDULE ? basal : pump->commanded * 5;
-    const int32_t estimate = (int32_t)round_divide(milliunits, 12);
+    const int32_t estimate = (int32_t)round_divide(milliunits, STEPS_PER_HOUR);
     pump->estimated += estimate;
     return estimate;
+}
+
+/* Pramlintide delivered since the last total, 0.01 ug; this firmware asks for none. Before the insulin of the step is
+ * judged, which takes note of the boot count. */
+static int32_t pramlintide(struct pump *pump)
+{
+    const struct pumpbench_pump_delivered_t *totals = &pump->totals;
+    if (!pump->totals_came || totals->pram_total >= PUMPBENCH_PUMP_DELIVERED_PRAM_TOTAL_ERROR_CHOICE ||
+        totals->pump_boot_count >= PUMPBENCH_PUMP_DELIVERED_PUMP_BOOT_COUNT_SNA_CHOICE) {
+        return 0;
+    }
+    const int32_t last = pump->pram_total, total = (int32_t)totals->pram_total;
+    const bool rebooted = totals->pump_boot_count != pump->boot_count;
+    if (last >= 0 && total < last && !rebooted) {
+        return 0;
+    }
+    pump->pram_total = total;
+    return last < 0 ? 0 : rebooted ? total : total - last;
+}
+
+/* Hold what the totals grew by against what was asked for: a motor that slips or runs away shows here, and air. Over a
+ * gap nobody knows what was asked for. It only tells; what counts for doses is what the totals say. */
+static void balance(struct pump *pump, int32_t insulin, int32_t pram, int32_t basal, int32_t skipped)
+{
+    const bool known = pump->totals_came && skipped == 0 && insulin >= 0;
+    if (known && pump->balanced) {
+        const int32_t rate = pump->commanded == SCHEDULE ? basal : pump->commanded * 5;
+        pump->insulin_balance += (int64_t)insulin * STEPS_PER_HOUR - rate;
+        pump->pram_balance += (int64_t)pram * STEPS_PER_HOUR;
+    } else {
+        pump->insulin_balance = 0;
+        pump->pram_balance = 0;
+    }
+    pump->balanced = known;
+}
+
+/* Whether a balance is off by more than ten strokes; it is rounded down. */
+static bool is_off(int64_t twelfths)
+{
+    return twelfths < -(int64_t)UNBALANCED * STEPS_PER_HOUR || twelfths >= ((int64_t)UNBALANCED + 1) * STEPS_PER_HOUR;
 }
 
 /* Fill the set-point of this step, with a new number and an absolute expiry; whether the pump's limit has cut it. */
@@ -330,7 +372,7 @@ static bool set_point(struct pump *pump, uint8_t op, int32_t step, int32_t rate,
 
 static void day_add(struct day *day, int32_t amount, int32_t step)
 {
-    const int32_t hour = step / 12;
+    const int32_t hour = step / STEPS_PER_HOUR;
     for (int32_t passed = 0; passed < hour - day->hour && passed < DAY_HOURS; passed++) {
         day->hours[(hour - passed) % DAY_HOURS] = 0;
     }
@@ -458,7 +500,8 @@ static void check_clock(struct supervisor *supervisor, int32_t step, uint32_t si
     }
 }
 
-static int32_t hear_pump(struct supervisor *supervisor, int32_t step, const struct calibration *calibration)
+static int32_t hear_pump(struct supervisor *supervisor, int32_t step, int32_t skipped,
+                         const struct calibration *calibration)
 {
     struct pump *pump = &supervisor->pump;
     if (pump->status_came) {
@@ -470,7 +513,10 @@ static int32_t hear_pump(struct supervisor *supervisor, int32_t step, const stru
         }
     }
     pump->bolus_states_heard = (uint16_t)(pump->bolus_states_heard | pump->bolus_states_came);
-    const int32_t given = delivered(pump, step, calibration->parameters.basal);
+    const int32_t basal = calibration->parameters.basal;
+    const int32_t pram = pramlintide(pump);
+    const int32_t given = delivered(pump, step, basal);
+    balance(pump, given, pram, basal, skipped);
     day_add(&supervisor->day, given > 0 ? given : 0, step);
     pump->status_came = false;
     pump->totals_came = false;
@@ -574,7 +620,9 @@ static void report_alarms(struct supervisor *supervisor, int32_t step, const str
     alarms_hold(alarms, ALARM_DOSE_LIMITED, step - supervisor->last_limited < ALARM_HOLD, step);
     alarms_hold(alarms, ALARM_DOSE_REJECTED, step - supervisor->last_rejected < ALARM_HOLD, step);
     alarms_hold(alarms, ALARM_PUMP_LOST, state == LADDER_DELIVERY_UNCERTAIN, step);
-    alarms_hold(alarms, ALARM_DELIVERY_UNCERTAIN, supervisor->pump.unlike >= UNLIKE_STEPS, step);
+    const struct pump *pump = &supervisor->pump;
+    const bool amiss = pump->unlike >= UNLIKE_STEPS || is_off(pump->insulin_balance) || is_off(pump->pram_balance);
+    alarms_hold(alarms, ALARM_DELIVERY_UNCERTAIN, amiss, step);
     alarms_hold(alarms, ALARM_URGENT_LOW, supervisor->urgent, step);
     alarms_hold(alarms, ALARM_CLOCK_JUMP, step - supervisor->last_jump < ALARM_HOLD, step);
     const bool bitten = supervisor->overruns_in_a_row >= BITES_AFTER;
@@ -637,7 +685,7 @@ void supervisor_step(struct supervisor *supervisor, int32_t step, uint32_t sim_t
 
     const int32_t glucose =
         judge_sensor(supervisor, step, calibration->supervision.stuck_samples, counts->lost_readings);
-    int32_t given = hear_pump(supervisor, step, calibration);
+    int32_t given = hear_pump(supervisor, step, skipped, calibration);
     const int32_t tick = step * STEP_SECONDS;
     if (tick - supervisor->self_test_tick >= SELF_TEST_SECONDS) {
         supervisor->self_test_tick = tick;
@@ -647,7 +695,7 @@ void supervisor_step(struct supervisor *supervisor, int32_t step, uint32_t sim_t
     climb(supervisor, step, calibration);
     report->work += (uint32_t)catch_up(supervisor, skipped, calibration);
     if (given > 0) { /* what the schedule gave in the steps that were caught up has been counted there */
-        const int64_t more = given - round_divide((int64_t)calibration->parameters.basal * skipped, 12);
+        const int64_t more = given - round_divide((int64_t)calibration->parameters.basal * skipped, STEPS_PER_HOUR);
         given = more > 0 ? (int32_t)more : 0;
     }
     control(supervisor, glucose, given, calibration);
@@ -673,7 +721,7 @@ void supervisor_boot(struct supervisor *supervisor)
     pump->sequence = SEQUENCES_BASAL - 1;
     pump->commanded = SCHEDULE;
     pump->rate_limit = RATE_MAX;
-    pump->total = -1;
+    pump->total = pump->pram_total = -1;
     pump->boot_count = PUMPBENCH_PUMP_DELIVERED_PUMP_BOOT_COUNT_SNA_CHOICE;
     supervisor->state = supervisor->reported = LADDER_INIT;
     supervisor->rung = LADDER_SAFE_BASAL;

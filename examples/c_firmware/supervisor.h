@@ -65,6 +65,10 @@ struct pump {
     int32_t total;                 /* mU, the newest one; -1 before the first */
     uint8_t boot_count;            /* PumpBootCount of that total */
     int64_t estimated;             /* mU assumed and not yet covered by a total */
+    int32_t pram_total;            /* 0.01 ug, the newest one; -1 before the first */
+    bool balanced;                 /* the balances below held in the step before: no gap since */
+    int64_t insulin_balance;       /* 1/12 mU that the totals grew more than was asked for */
+    int64_t pram_balance;          /* 1/12 of 0.01 ug */
     uint32_t refused;              /* totals that fell without a reset, answers that were not Accepted */
     uint32_t unanswered;
 };

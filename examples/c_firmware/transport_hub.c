@@ -161,27 +161,32 @@ static bool hub_open(const char *url)
     return connected && greet();
 }
 
+/* Why no frame follows: a goodbye of the hub, or what no frame of classic CAN can be. */
+static void tell_end(const uint8_t *record)
+{
+    if (little_endian(record) == GOODBYE_ID && record[4] == GOODBYE_LEN) {
+        fprintf(stderr, "firmware: the hub ended the connection (reason %lu)\n",
+                (unsigned long)little_endian(record + 8));
+    } else {
+        fprintf(stderr, "firmware: this is no frame of classic CAN: a length of %u\n", (unsigned)record[4]);
+    }
+}
+
 static size_t hub_receive(struct frame frames[TRANSPORT_BATCH])
 {
     if (!fill()) {
         return 0u;
     }
     size_t n = 0u;
-    for (size_t place = 0u; place + RECORD <= buffered; place += RECORD) {
-        const uint8_t *record = buffer + place;
-        struct frame *frame = &frames[n++];
-        frame->can_id = little_endian(record);
-        frame->len = record[4];
-        memcpy(frame->data, record + 8, FRAME_DATA_MAX);
-        if (frame->len > FRAME_DATA_MAX) {
-            if (frame->can_id == GOODBYE_ID && frame->len == GOODBYE_LEN) {
-                fprintf(stderr, "firmware: the hub ended the connection (reason %lu)\n",
-                        (unsigned long)little_endian(record + 8));
-            } else {
-                fprintf(stderr, "firmware: this is no frame of classic CAN: a length of %u\n", (unsigned)frame->len);
-            }
-            return n - 1u; /* what came before is still heard; nothing comes after */
-        }
+    const uint8_t *record = buffer;
+    for (; (n + 1u) * RECORD <= buffered && record[4] <= FRAME_DATA_MAX; record += RECORD) {
+        frames[n].can_id = little_endian(record);
+        frames[n].len = record[4];
+        memcpy(frames[n].data, record + 8, FRAME_DATA_MAX);
+        n++;
+    }
+    if (n == 0u) { /* what came before it has been heard in an earlier call */
+        tell_end(record);
     }
     drop(n * RECORD);
     return n;

@@ -1,5 +1,5 @@
 /* Linux SocketCAN: vcan, or any adapter with a kernel driver. */
-#define _DEFAULT_SOURCE /* SO_RXQ_OVFL and friends are not of POSIX */
+#define _DEFAULT_SOURCE /* SO_RCVBUFFORCE and the CAN headers are Linux' own */
 
 #include <stdio.h>
 #include <string.h>
