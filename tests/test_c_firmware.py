@@ -68,7 +68,8 @@ def token(counter: int, phase: int, step: int, time: int = 0) -> Frame:
 
 def vector() -> tuple[list[Frame], list[Frame]]:
     """The day of the golden vectors: what the device hears, with a roll call before it, and what it answers."""
-    heard, said = [token(0, Phase.INIT, 1)], []
+    heard: list[Frame] = [token(0, Phase.INIT, 1)]
+    said: list[Frame] = []
     for line in VECTOR.read_text(encoding="ascii").splitlines():
         _, _, body, direction = line.split()
         can_id, _, data = body.partition("#")
