@@ -33,6 +33,10 @@ class Drug(enum.IntEnum):
 DOSE_FIELD = {Drug.INSULIN: "InsulinBolus", Drug.PRAMLINTIDE: "PramlintideBolus"}
 
 
+STROKE = 5
+"""Raw, of either drug: the pump gives whole strokes, so that less than one may be missing of a bolus."""
+
+
 class Op(enum.IntEnum):
     """PUMP_BolusCmd.BolusOp; NONE = nothing more to say."""
 
@@ -76,6 +80,7 @@ class _Bolus:
     sends: int = 0  # of `op`, in this step
     committed: bool = False  # a Commit was sent: it may be delivered
     uncertain: bool = False
+    cancelled: bool = False  # the device itself wants it no more
     remaining: int = 0  # raw, committed and in no total yet
     ack: tuple[int, int] | None = None  # result and echo of the stage in question
 
@@ -86,6 +91,7 @@ class Boluses:
     def __init__(self) -> None:
         self.next_id = 0
         self.refused = 0  # boluses the pump refused or understood wrongly, so far
+        self.short = dict.fromkeys(Drug, 0)  # raw, of boluses that ended before they were whole, so far
         self.unanswered = 0  # commands that no acknowledgement came for, so far
         self.limit = {Drug.INSULIN: 4000, Drug.PRAMLINTIDE: 4000}  # what the pump accepts, as it last said
         self._open: dict[Drug, _Bolus] = {}
@@ -171,6 +177,7 @@ class Boluses:
             bolus.committed = True
             bolus.uncertain = False
             if phase != Phase.DELIVERING:
+                self.short[drug] += left if left >= STROKE and not bolus.cancelled else 0
                 del self._open[drug]
         elif phase == Phase.PROGRAMMED:
             bolus.op = Op.CANCEL  # programmed and not committed: nobody shall commit it any more
@@ -185,6 +192,7 @@ class Boluses:
         """End every bolus that has not ended yet, e.g. because the user suspends."""
         for bolus in self._open.values():
             bolus.op = Op.CANCEL
+            bolus.cancelled = True
             bolus.sends = 0
             bolus.ack = None
 

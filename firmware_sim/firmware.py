@@ -179,6 +179,7 @@ class Firmware:
         self._samples: list[dict[str, int]] = []
         self._totals: dict[str, int] | None = None
         self._totals_known = False  # in the step before
+        self._short_seen = dict.fromkeys(Drug, 0)
         self._status: dict[str, int] | None = None
         self._bolus_states: set[int] = set()  # drugs heard of in this step
         self._rejected = False
@@ -493,7 +494,9 @@ class Firmware:
         told = self._boluses.open_step(step)
         bolus, pram_bolus = (sum(raw * 10 for drug, raw in told if drug == wanted) for wanted in Drug)
         delivered = self._pump.delivered(self._totals, step, basal, bolus)
-        self._balance(basal, {Drug.INSULIN: (bolus, delivered), Drug.PRAMLINTIDE: (pram_bolus, pramlintide)})
+        # of a bolus that ended too early all that was asked for is held against the pump
+        asked, pram_asked = bolus + self._newly_short(Drug.INSULIN), pram_bolus + self._newly_short(Drug.PRAMLINTIDE)
+        self._balance(basal, {Drug.INSULIN: (asked, delivered), Drug.PRAMLINTIDE: (pram_asked, pramlintide)})
         self._status = None
         self._totals = None
         self._insulin_day.add(max(delivered, 0), step)
@@ -509,6 +512,12 @@ class Firmware:
             else:
                 self._balances[drug].reset()
         self._totals_known = known
+
+    def _newly_short(self, drug: Drug) -> int:
+        """In mU or 0.01 ug."""
+        short = self._boluses.short[drug]
+        new, self._short_seen[drug] = short - self._short_seen[drug], short
+        return new * 10
 
     def _unbalanced(self) -> bool:
         return any(balance.off(self._boluses.remaining(drug) * 10) for drug, balance in self._balances.items())

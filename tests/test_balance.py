@@ -2,6 +2,8 @@
 
 import pytest
 from bench import GLUCOSE, NMA, Bench
+from pumpbench import faults
+from pumpbench.bench import Outcome, run
 
 from firmware_sim.alarms import Code
 from firmware_sim.balance import Balance
@@ -74,3 +76,21 @@ def test_a_gap_in_the_totals_is_no_difference() -> None:
     assert not bench.step().alarms(Code.DELIVERY_UNCERTAIN)
     bench.total += 12 * 200
     assert bench.step().alarms(Code.DELIVERY_UNCERTAIN)
+
+
+def test_a_bolus_that_ends_before_it_is_whole_is_held_against_the_pump() -> None:
+    """Air in a bolus: the pump tells of less than was programmed, and of nothing else (found by the matrix)."""
+    air = faults.air_bubble("insulin", 20, start="02:00")
+    outcome = bench_run(strategy="s3", patient="adult#004", seed=14, faults=[air])
+    outcome.assert_alarm("DeliveryUncertain", after="02:00", within="02:00")
+    outcome.assert_ledger_closes()
+
+
+def test_a_bolus_short_of_a_stroke_is_whole() -> None:
+    """Doses are in 0.01 U, strokes in 0.05: what is missing of many boluses never adds up to an alarm."""
+    outcome = bench_run(strategy="sma", patient="adult#004", hours=24 * 14, scenario="validation-14d")
+    assert outcome.raised(node="CTRL") == []
+
+
+def bench_run(**keys: object) -> Outcome:
+    return run(**({"scenario": "six-hours", "hours": 6} | keys))  # type: ignore[arg-type]

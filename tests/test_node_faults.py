@@ -396,3 +396,14 @@ def test_a_killed_gateway_ends_the_run(pumpbench: Pumpbench, runs: Path) -> None
     )  # fmt: skip
     assert done.returncode == 3, done.stderr
     assert "the gateway was killed by SIGKILL" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_device_that_starts_anew_raises_nothing_of_its_earlier_life() -> None:
+    lost = drop("CGM_Reading", start="00:30", end="01:20")
+    for memory in ("kept", "lost"):
+        given = [lost, restart(start="01:00", memory=memory)]
+        outcome = bench.run(strategy="nma", scenario="fasting", hours=2, faults=given)
+        first = [event for event in outcome.alarms if event.code == "CgmLost" and event.node == "CTRL"]
+        assert first[0].state == "Pending"
+        ends = [event.time_s for event in first if event.instance == first[0].instance and event.state == "Inactive"]
+        assert 3600 <= ends[0] < 3601

@@ -9,7 +9,6 @@ from pumpbench.calibration import MODES
 from pumpbench.catalogue import Entry, entries
 from pumpbench.probe import Probe, Verdict
 
-
 RUNS_TO_TELL = 7
 """Runs of an entry from which on what shows in all of them is no chance."""
 

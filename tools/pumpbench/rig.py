@@ -534,11 +534,11 @@ def _processes(prepared: Prepared) -> Path:
             threading.Thread(target=attend, args=(ours, firmware), daemon=True).start()
 
         def watch() -> None:
-            if firmware is not None:
-                firmware.check()
-            for child in list(children):
+            for child in list(children):  # a dead gateway is why a firmware ends, not the other way round
                 if child.name != "firmware":
                     child.check()
+            if firmware is not None:
+                firmware.check()
 
         try:
             serve(

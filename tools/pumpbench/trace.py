@@ -546,23 +546,43 @@ def _increments(totals: Array, epochs: Array) -> Array:
     return result
 
 
+def _boots(frames: Frames) -> list[float]:
+    """When the device has started anew, as it said."""
+    decoded = decode(frames, "HB_CTRL", 0)
+    boot_up = codec.choice("HB_CTRL", "NmtCtrl", "BootUp")
+    rows = decoded.rows[decoded.raw["NmtCtrl"] == boot_up]
+    return [float(time_s) for time_s in frames.time_s[rows]]
+
+
 def _alarms(frames: Frames, source: int) -> list[AlarmEvent]:
     events: list[AlarmEvent] = []
     for node, channel, prefix in (("CTRL", 0, "CtrlAlarm"), ("PUMP", source, "PumpAlarm")):
         message = f"{node}_Alarm"
         decoded = decode(frames, message, channel)
-        names = {part: labels(message, prefix + part) for part in ("Code", "State", "Priority")}
-        last: dict[int, tuple[int, int, int]] = {}
-        columns = (decoded.raw[prefix + part].tolist() for part in ("Instance", "Code", "State", "Priority"))
+        names = [labels(message, prefix + part) for part in ("Code", "State", "Priority")]
+        inactive = codec.choice(message, f"{prefix}State", "Inactive")
+        columns = (decoded.raw[prefix + part].tolist() for part in ("Code", "State", "Priority"))
+        instances: list[int | None] = decoded.raw[f"{prefix}Instance"].tolist()
         times = frames.time_s[decoded.rows].tolist()
-        for time_s, instance, code, state, priority in zip(times, *columns, strict=True):
-            now = (code, state, priority)
-            before = last.get(instance)
-            last[instance] = now
-            if now == before or (before is None and names["State"].get(state) == "Inactive"):
-                continue
-            texts = {part: names[part].get(value, str(value)) for part, value in zip(names, now, strict=True)}
-            events.append(AlarmEvent(time_s, node, texts["Code"], texts["State"], texts["Priority"], instance))
+        stream = list(zip(times, instances, zip(*columns, strict=True), strict=True))
+        if node == "CTRL":
+            stream = sorted([*stream, *((time_s, None, ()) for time_s in _boots(frames))], key=lambda each: each[0])
+        last: dict[int, Any] = {}
+        for time_s, instance, now in stream:
+            changes: list[tuple[int, Any]] = []
+            if instance is None:  # a device that starts anew no longer raises what it raised in an earlier life
+                changes = [
+                    (old, (code, inactive, rest)) for old, (code, state, rest) in last.items() if state != inactive
+                ]
+                last.clear()
+            else:
+                before = last.get(instance)
+                last[instance] = now
+                if now != before and (before is not None or now[1] != inactive):
+                    changes = [(instance, now)]
+            for number, values in changes:
+                code, state, priority = (each.get(raw, str(raw)) for each, raw in zip(names, values, strict=True))
+                events.append(AlarmEvent(time_s, node, code, state, priority, number))
     return sorted(events, key=lambda event: event.time_s)
 
 
