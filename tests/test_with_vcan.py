@@ -337,6 +337,12 @@ def test_a_wrong_setting_is_named(name, value):
     assert done.stderr.startswith(f"with_vcan: {name}={value}: ".encode())
 
 
+def test_candump_is_where_the_command_runs_and_cannot_be_written_to_there():
+    script = "command -v candump; test ! -w /run/can-utils -o -z \"$VCAN_GUEST\" && candump -T 1 vcan0"
+    done = run("sh", "-c", script)
+    assert (done.returncode, done.stdout[-8:]) == (0, b"candump\n"), done.stderr.decode()
+
+
 def test_a_command_that_is_not_there():
     done = run("no-such-command-anywhere")
     assert done.returncode == 127
@@ -365,8 +371,8 @@ def stage(tmp_path):
     )
 
 
-def play_apt(path, *, known="true"):
-    """An apt-get that has the package if `known` succeeds, a dpkg that unpacks it, and a kernel that panics at once."""
+def play_apt(path, *, known="true", can_utils="true"):
+    """An apt-get that has a package if its word succeeds, a dpkg that unpacks it, and a kernel that panics at once."""
     program(
         path / "apt-get",
         f"""
@@ -376,6 +382,8 @@ def play_apt(path, *, known="true"):
           *" update") touch "$STAGE/updated" ;;
           *" download user-mode-linux") {known} || {{ echo "E: Unable to locate package user-mode-linux"; exit 100; }}
             touch user-mode-linux_1_amd64.deb ;;
+          *" download can-utils") {can_utils} || {{ echo "E: Unable to locate package can-utils"; exit 100; }}
+            touch can-utils_1_amd64.deb ;;
         esac
         """,
     )
@@ -384,6 +392,7 @@ def play_apt(path, *, known="true"):
         r"""
         #!/bin/sh
         [ "$1" = -x ] && [ -e "$2" ] && mkdir -p "$3/usr/bin" && sleep 0.2 || exit 2
+        case "$2" in */can-utils_*) touch "$3/usr/bin/candump"; chmod +x "$3/usr/bin/candump"; exit ;; esac
         panic="echo booting; echo Kernel panic - not syncing: just played; echo Call Trace:; exit 134"
         printf '%s\n' '#!/bin/sh' '[ "$1" = --version ] && echo 1.2.3 && exit' "$panic" > "$3/usr/bin/linux.uml"
         chmod +x "$3/usr/bin/linux.uml"
@@ -417,8 +426,9 @@ def test_the_package_is_fetched_once_and_a_guest_that_dies_is_told(stage):
         )
     assert b"fetching" in first.stderr
     assert b"fetching" not in second.stderr
-    assert cached(root) == ["uml"]
-    assert (root / "apt.log").read_text().count("download") == 1
+    assert cached(root) == ["can-utils", "uml"]
+    for package in ("user-mode-linux", "can-utils"):
+        assert (root / "apt.log").read_text().count(f"download {package}") == 1
     assert left_behind(root / "tmp") == []
 
 
@@ -426,11 +436,25 @@ def test_without_package_lists_it_fetches_its_own(stage):
     root, path, env = stage
     play_apt(path, known='[ -e "$STAGE/updated" ]')
     run("true", env=env)
-    download, update, again = (root / "apt.log").read_text().splitlines()
+    download, update, again, _can_utils = (root / "apt.log").read_text().splitlines()
     assert "Dir::State::Lists" not in download, "the machine's lists first"
     for call in update, again:
         assert f"Dir::State::Lists={root}/cache/pumpbench/.fetch." in call, "never the machine's lists"
-    assert cached(root) == ["uml"]
+    assert cached(root) == ["can-utils", "uml"]
+
+
+def test_without_can_utils_it_runs_all_the_same_and_does_not_ask_again_at_once(stage):
+    root, path, env = stage
+    play_apt(path, can_utils="false")
+    first, second = (run("true", env=env).stderr.decode().splitlines() for _ in range(2))
+    assert "with_vcan: cannot fetch can-utils: E: Unable to locate package can-utils: no candump in the guest" in first
+    assert second[-1] == first[-1] == "with_vcan: the guest died: Kernel panic - not syncing: just played"
+    assert not any("can-utils" in line for line in second)
+    assert cached(root) == [".no-can-utils", "uml"]
+    os.utime(root / "cache/pumpbench/.no-can-utils", (0, 0))
+    play_apt(path)
+    assert any("fetching the Debian package can-utils" in line for line in run("true", env=env).stderr.decode().split("\n"))
+    assert (root / "cache/pumpbench/can-utils/usr/bin/candump").exists()
 
 
 def test_a_package_that_cannot_be_fetched_is_told_and_leaves_nothing(stage):
@@ -452,8 +476,10 @@ def test_two_fetches_at_once_and_one_that_was_interrupted_before(stage):
     for call in calls:
         with call:
             assert call.stderr.read().decode().splitlines()[-1].endswith("just played")
-    assert cached(root) == ["uml"]
-    assert (root / "apt.log").read_text().count("download") == 1, "the second finds what the first has fetched"
+    assert cached(root) == ["can-utils", "uml"]
+    for package in ("user-mode-linux", "can-utils"):
+        fetched = (root / "apt.log").read_text().count(f"download {package}")
+        assert fetched == 1, "the second finds what the first has fetched"
     assert not (root / "cache/pumpbench/uml/root").exists(), "not one inside the other"
 
 
