@@ -29,8 +29,8 @@ def test_what_came_of_it(lost: Outcome) -> None:
     assert [event.code for event in lost.raised(node="CTRL")] == ["CgmLost"]
     assert lost.raised("CgmLost", "PUMP") == []
     assert len(lost.glucose) == 73
-    assert lost.minutes_above(250) == 5 * np.count_nonzero(lost.glucose > 250)
-    assert lost.minutes_below(400) == 5 * 73
+    assert lost.minutes_above(250) == 5 * np.count_nonzero(lost.glucose[:-1] > 250)
+    assert lost.minutes_below(400) == 5 * 72
     assert repr(lost) == f"<Outcome of {lost.title}>" and "adult#001" in lost.title
 
 

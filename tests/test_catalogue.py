@@ -9,7 +9,7 @@ from conftest import Pumpbench
 from pumpbench import catalogue, matrix, probe
 from pumpbench.bench import Outcome
 from pumpbench.catalogue import Entry, entries
-from pumpbench.faults import KINDS, load
+from pumpbench.faults import KINDS, drop, load
 from pumpbench.probe import Probe, Verdict, in_parallel, judge
 from pumpbench.trace import labels
 from pydantic import ValidationError
@@ -104,6 +104,14 @@ def test_a_verdict_is_against_the_same_run_without_faults() -> None:
     assert not verdict.failed and verdict.injected == 8
     assert verdict.signs == {"CTRL.CgmLost", "LostFrameCount", "SequenceErrorCount"}
     assert judge(Probe()) == Verdict({}, None, frozenset(), 0)
+
+
+@pytest.mark.parametrize(("mode", "seed"), [("sma", 3), ("s2", 4)])
+def test_the_compiled_twin_is_the_twin(mode: str, seed: int) -> None:
+    for scenario, hours in (("six-hours", 6.0), ("camerlingo", 24.0), ("validation-14d", 11.5)):
+        probe = Probe("adult#008", mode, seed, scenario, hours, (drop("CGM_Reading", start="01:00", end="05:00"),))
+        slow, quick = judge(probe), judge(probe, signs=False)
+        assert quick == slow._replace(signs=frozenset())
 
 
 def test_a_run_that_breaks_off_is_a_verdict(monkeypatch: pytest.MonkeyPatch) -> None:

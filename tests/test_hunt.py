@@ -114,7 +114,7 @@ def test_a_run_that_broke_off_shrinks_too() -> None:
 # ---- a hunt
 
 
-def half_bad(probe: Probe) -> Verdict:
+def half_bad(probe: Probe, *, signs: bool) -> Verdict:
     """Cases with a fault of the pump's frames fail."""
     guilty = any(getattr(fault, "message", "").startswith("PUMP") for fault in probe.faults)
     return bad() if guilty else CLEAN._replace(low=float(probe.seed))
@@ -134,7 +134,7 @@ def test_what_fails_is_kept_as_a_test_that_runs(tmp_path: Path, monkeypatch: pyt
     )  # fmt: skip
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout  # the real firmware does no harm there
     assert result.lowest[0][1] >= result.lowest[-1][1] > 0
-    monkeypatch.setattr(hunt, "judge", lambda probe: pytest.fail("judged again"))
+    monkeypatch.setattr(hunt, "judge", lambda probe, signs: pytest.fail("judged again"))
     assert hunt.run(Settings(tmp_path, 40)) == result
 
 
@@ -158,7 +158,7 @@ def test_the_folder_of_another_hunt_is_refused(tmp_path: Path, monkeypatch: pyte
 
 
 def test_too_much_time_low_or_high_is_a_failure_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hunt, "judge", lambda probe: CLEAN._replace(low=30.0, high=10.0))
+    monkeypatch.setattr(hunt, "judge", lambda probe, signs: CLEAN._replace(low=30.0, high=10.0))
     assert hunt.run(Settings(tmp_path / "a", 3)).failed == 0
     assert hunt.run(Settings(tmp_path / "b", 3, max_low=30.0, max_high=10.0)).failed == 0
     caught: list[Found] = []

@@ -205,11 +205,11 @@ class Outcome:
 
     def minutes_below(self, level: float) -> float:
         """Simulated minutes with true glucose below this level, mg/dL."""
-        return float(np.count_nonzero(self.glucose < level)) * STEP_SECONDS / 60
+        return float(np.count_nonzero(self.glucose[:-1] < level)) * STEP_SECONDS / 60  # the end is no interval
 
     def minutes_above(self, level: float) -> float:
         """The same above it."""
-        return float(np.count_nonzero(self.glucose > level)) * STEP_SECONDS / 60
+        return float(np.count_nonzero(self.glucose[:-1] > level)) * STEP_SECONDS / 60
 
     def states(self) -> list[tuple[int, str]]:
         """Simulated seconds and name of every CtrlState the device took up, in order."""

@@ -407,7 +407,7 @@ def run(
 
 
 def _judge_within(max_low: float | None, max_high: float | None, probe: Probe) -> Verdict:
-    verdict = judge(probe)
+    verdict = judge(probe, signs=False)
     over = [
         f"{minutes:g} min {what} mg/dL"
         for minutes, limit, what in ((verdict.low, max_low, "below 54"), (verdict.high, max_high, "above 250"))
