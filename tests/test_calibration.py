@@ -10,7 +10,15 @@ from pumpbench.calibration import CalibrationError, Tuning, calibrate
 from can_bus import codec
 from can_bus.lockstep import Phase
 from firmware_sim.alarms import Code
-from firmware_sim.calibration import CORE, LOWEST, SET_CRC_INDEX, UNSET, parameter_names, set_crc
+from firmware_sim.calibration import (
+    CORE,
+    LOWEST,
+    SET_CRC_INDEX,
+    UNSET,
+    Calibration,
+    parameter_names,
+    set_crc,
+)
 from firmware_sim.control import layout
 from firmware_sim.ladder import State
 from firmware_sim.pump import Op
@@ -262,3 +270,7 @@ def test_a_patient_without_a_model_is_named() -> None:
 
     with pytest.raises(CalibrationError, match="nobody"):
         calibrate(replace(load_patient("adult#001"), name="nobody"))
+
+
+def test_before_a_calibration_every_parameter_is_zero() -> None:
+    assert set(Calibration().parameters) == {0}

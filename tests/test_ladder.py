@@ -539,3 +539,10 @@ def test_missing_samples_never_raise_insulin() -> None:
         rates.append(turn.command["InsulinRate"])
     assert rates == sorted(rates, reverse=True)
     assert turn.status["LimiterBits"] & 16
+
+
+def test_one_sample_and_no_more_is_not_a_start_for_ever() -> None:
+    """The device waits for a second sample until the first one is too old for anything but the schedule."""
+    bench = Bench()
+    states = [bench.step().state, *(bench.step(drop=True).state for _ in range(8))]
+    assert states == [State.INIT] * 7 + [SAFE_BASAL] * 2

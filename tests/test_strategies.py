@@ -388,3 +388,25 @@ def test_a_low_in_half_an_hour_is_seen_on_the_line_through_three_samples(
     assert limits.soon_low(kept, parameters(LOW_SUSPEND=700), inputs()) == soon
     assert rate(900, memory={"TREND": trend, **memory}) == ((200, 8) if soon else (900, 0))
     assert bolus(memory={"TREND": trend, **memory})[:2] == ((0, 8) if soon else (500, 0))
+
+
+@pytest.mark.parametrize(("mode", "dose"), [(layout.MODE_S3, 120), (layout.MODE_S4, 1)])
+def test_the_smallest_insulin_bolus_brings_its_pramlintide(mode: int, dose: int) -> None:
+    told = outputs()
+    flashed = parameters(
+        MEAL_GAIN=1, CARB_RATIO=4000, MEAL_FACTOR=800, ASSUMED_CARBS=1, PRAM_BOLUS=120, PRAM_RATIO=1000
+    )
+    meal = inputs(IN_MODE=mode, IN_DELIVERED=-1, IN_MEAL=MEAL_CARBS, IN_CARBS=1)  # half a gram at 40 g/U
+    core.control_step(state(GLUCOSE=1500, PRIMED=1, TREND=3, GLUCOSE_1=1500, GLUCOSE_2=1500), flashed, meal, told)
+    assert (told[layout.OUT_BOLUS], told[layout.OUT_PRAM_BOLUS]) == (1, dose)
+
+
+def test_a_limited_pramlintide_bolus_is_told_of() -> None:
+    told = outputs()
+    flashed = parameters(
+        MEAL_GAIN=1, CARB_RATIO=1000, MEAL_FACTOR=800, ASSUMED_CARBS=80, PRAM_BOLUS=50, PRAM_RATIO=1000
+    )
+    meal = inputs(IN_MODE=layout.MODE_S4, IN_DELIVERED=-1, IN_MEAL=MEAL_CARBS, IN_CARBS=80)
+    core.control_step(state(GLUCOSE=1500, PRIMED=1, TREND=3, GLUCOSE_1=1500, GLUCOSE_2=1500), flashed, meal, told)
+    assert told[layout.OUT_PRAM_BOLUS] == 50
+    assert told[layout.OUT_LIMITERS] & layout.LIMITER_MAX_BOLUS
