@@ -338,8 +338,9 @@ def test_a_wrong_setting_is_named(name, value):
 
 
 def test_candump_is_where_the_command_runs_and_cannot_be_written_to_there():
-    script = "command -v candump; test ! -w /run/can-utils -o -z \"$VCAN_GUEST\" && candump -T 1 vcan0"
-    done = run("sh", "-c", script)
+    done = run("sh", "-c", "command -v candump && test ! -w /run/can-utils && exec candump -T 1 vcan0")
+    if done.returncode and b": kernel " in done.stderr and not os.environ.get("CI"):
+        pytest.skip("a kernel with CAN of its own: apt-get install can-utils")
     assert (done.returncode, done.stdout[-8:]) == (0, b"candump\n"), done.stderr.decode()
 
 
@@ -453,7 +454,7 @@ def test_without_can_utils_it_runs_all_the_same_and_does_not_ask_again_at_once(s
     assert cached(root) == [".no-can-utils", "uml"]
     os.utime(root / "cache/pumpbench/.no-can-utils", (0, 0))
     play_apt(path)
-    assert any("fetching the Debian package can-utils" in line for line in run("true", env=env).stderr.decode().split("\n"))
+    assert b"fetching the Debian package can-utils" in run("true", env=env).stderr
     assert (root / "cache/pumpbench/can-utils/usr/bin/candump").exists()
 
 

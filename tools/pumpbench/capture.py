@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -380,26 +381,55 @@ def write_candump(frames: Frames, path: Path, names: Sequence[str] = ("can0", "c
             file.write(f"({seconds}.{fraction:06d}) {names[channel]} {text}\n")
 
 
-def _parse_line(line: str) -> tuple[str, int, bytes]:
-    """Interface, id with flags and data of one line of a candump log.
+class LogLine(NamedTuple):
+    """One line of a candump log."""
+
+    time_s: float
+    interface: str
+    frame: Frame
+    is_rx: bool
+    """False only where the log says that this machine sent the frame."""
+
+
+def _parse_line(line: str) -> LogLine:
+    """Take a line of a candump log apart.
 
     Raises:
-        ValueError: the line is none.
+        ValueError, IndexError: it is none.
     """
     stamp, name, frame, *direction = line.split()
     if stamp[0] != "(" or stamp[-1] != ")" or direction not in ([], ["R"], ["T"]):
         raise ValueError(line)
-    float(stamp[1:-1])
+    time_s = float(stamp[1:-1])
     ident, _, payload = frame.partition("#")
     can_id = int(ident, 16)
     if len(ident) == 8 and not can_id & CAN_ERR_FLAG:
         can_id |= CAN_EFF_FLAG
     if payload[:1] in ("R", "r"):
-        return name, can_id | CAN_RTR_FLAG, bytes(int(payload[1:] or 0))
-    data = bytes.fromhex(payload)
-    if len(data) > MAX_DATA or can_id > 0xFFFFFFFF:
+        can_id, data = can_id | CAN_RTR_FLAG, bytes(int(payload[1:] or 0))
+    else:
+        data = bytes.fromhex(payload)
+    if len(data) > MAX_DATA or not 0 <= can_id <= 0xFFFFFFFF or not math.isfinite(time_s):
         raise ValueError(line)
-    return name, can_id, data
+    return LogLine(time_s, name, Frame(can_id, data), direction != ["T"])
+
+
+def read_lines(path: Path) -> Iterator[LogLine]:
+    """Read a candump log line by line, as it is.
+
+    Raises:
+        ValueError: a line is no frame of classic CAN; the text says which.
+        OSError: the file cannot be read.
+    """
+    with path.open(encoding="ascii", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if not line.strip():
+                continue
+            try:
+                parsed = _parse_line(line)
+            except (ValueError, IndexError):
+                raise ValueError(f"{path}:{number}: not a line of a candump log: {line.strip()[:60]!r}") from None
+            yield parsed
 
 
 def read_candump(path: Path, names: Sequence[str] = ("can0", "can1")) -> Frames:
@@ -414,15 +444,8 @@ def read_candump(path: Path, names: Sequence[str] = ("can0", "can1")) -> Frames:
         OSError: the file cannot be read.
     """
     found: dict[str, list[Frame]] = {}
-    with path.open(encoding="ascii", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            if not line.strip():
-                continue
-            try:
-                name, can_id, data = _parse_line(line)
-            except (ValueError, IndexError):
-                raise ValueError(f"{path}:{number}: not a line of a candump log: {line.strip()[:60]!r}") from None
-            found.setdefault(name, []).append(Frame(can_id, data))
+    for line in read_lines(path):
+        found.setdefault(line.interface, []).append(line.frame)
     capture = Capture()
     channels = list(names) if set(found) <= set(names) else sorted(found)
     for name, frames in found.items():

@@ -438,6 +438,24 @@ def benchmark(
         errors.print("no vcan on this machine and tools/with_vcan could not provide one: its figures are missing")
 
 
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="RUN_OR_LOG", help="A run folder, or any log in candump format.")],
+    out: Annotated[
+        Path, typer.Argument(help="File to write: .blf, .asc, .trc, .csv, .log, .db, .txt; .mf4 with asammdf.")
+    ],
+    only: Annotated[str | None, typer.Option(help="Only this interface of the log, e.g. can0.")] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
+) -> None:
+    """Convert bus.log or a candump log into the format of another tool, channels and time stamps kept."""
+    from pumpbench import convert as converter  # noqa: PLC0415
+
+    done = converter.convert(source, out, overwrite=overwrite, only=only)
+    if done.left_out:
+        errors.print(f"{out.suffix} has no remote or error frames: {done.left_out} were left out", markup=False)
+    console.print(f"{done.frames} frames of {', '.join(done.channels) or 'no interface'}: {out}", soft_wrap=True)
+
+
 app.command(name="faults")(faults_command)
 app.command()(matrix)
 app.command()(hunt)
@@ -481,6 +499,7 @@ def _status(error: Exception) -> int | None:
     from pumpbench.campaign import CampaignError, ClusterError  # noqa: PLC0415
     from pumpbench.closed_loop import CaseError, LoopError  # noqa: PLC0415
     from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
+    from pumpbench.convert import ConvertError  # noqa: PLC0415
     from pumpbench.hunt import HuntError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
@@ -492,7 +511,8 @@ def _status(error: Exception) -> int | None:
     wrong = (
         CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
     )
-    if isinstance(error, wrong | CalibrationError | ControllerModelError | HuntError | RigError | RunFolderError):
+    wrong |= CalibrationError | ControllerModelError | ConvertError | HuntError | RigError | RunFolderError
+    if isinstance(error, wrong):
         return EXIT_USAGE
     if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD
