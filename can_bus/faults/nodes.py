@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from .base import Fault
 
 MemoryState = Literal["kept", "torn", "lost"]
-"""What becomes of the non-volatile memory: nothing; the newest record is half written; it is blank."""
+"""What becomes of the non-volatile memory: nothing; the record being written is half written; it is blank."""
 
 
 class NodeControl(Protocol):

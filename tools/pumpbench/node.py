@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 def tear(memory: Memory, words: int) -> None:
-    """Leave the newest record of the reference firmware's memory half written, as a power cut would.
+    """Leave the record that the reference firmware would write next half written, as a power cut in that write would.
+
+    It goes where the newest record is not; that one was whole before any frame that depends on it left.
 
     Args:
         memory: two banks for records of at most so many `words` (`firmware_sim.nvm`); nothing happens to a blank one.
@@ -30,7 +32,8 @@ def tear(memory: Memory, words: int) -> None:
     newest = 0 if written[0] and (not written[1] or first_is_newer) else 1
     written_words = int.from_bytes(memory.read(newest * size + 4 * (HEADER_WORDS - 2), 4), "little")
     half = 4 * (HEADER_WORDS + min(written_words, words) // 2)
-    memory.write(newest * size + half, bytes([ERASED]) * (size - half))
+    begun = memory.read(newest * size, half)
+    memory.write((1 - newest) * size, begun + bytes([ERASED]) * (size - half))
 
 
 class InProcess:
