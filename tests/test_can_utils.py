@@ -55,7 +55,7 @@ def decode(frame: Frame) -> dict[str, Any]:
 
 
 def can_utils() -> None:
-    """On request only: these race a run against tools of the wall clock, and lose where other tests keep the CPUs busy."""
+    """On request only: they race a run against tools of the wall clock, and lose where others keep the CPUs busy."""
     if os.environ.get("PUMPBENCH_CAN_UTILS") != "1":
         pytest.skip("on request: PUMPBENCH_CAN_UTILS=1")
     need_vcan()
