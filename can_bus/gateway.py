@@ -41,6 +41,9 @@ from can_bus.node_control import CommandControl, SocketControl
 from can_bus.process import exit_status
 from can_bus.url import open_link
 
+TAP_EVERY = 0.2
+"""Seconds after which a tap's hub is run even if nothing crosses: a recorder may be knocking."""
+
 
 class Side(enum.IntEnum):
     """The two ends of the gateway; also the channel numbers of a recording."""
@@ -340,7 +343,7 @@ def serve(gateway: Gateway, device: Link, plant: Link, tap: Link | None = None) 
     """
     sides = {device.fileno(): (device, Side.DEVICE), plant.fileno(): (plant, Side.PLANT)}
     while not gateway.finished:
-        ready, _, _ = select.select(list(sides), [], [], 0.2)
+        ready, _, _ = select.select(list(sides), [], [], None if tap is None else TAP_EVERY)
         for descriptor in ready:
             link, side = sides[descriptor]
             to_device: list[Frame] = []

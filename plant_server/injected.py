@@ -5,7 +5,9 @@ from typing import ClassVar
 from pydantic import BaseModel, ConfigDict
 
 from can_bus import codec
-from can_bus.faults import TARGETS
+from can_bus.faults import TARGETS, report
+from can_bus.frame import Frame
+from can_bus.lockstep import STEP_SECONDS
 
 
 class Injected(BaseModel):
@@ -20,12 +22,7 @@ class Injected(BaseModel):
     MESSAGE: ClassVar[str | None] = None
     """Whom it is done to, and which frames show it if they are those of one message."""
 
-    def report(self, step: int) -> dict[str, int]:
-        """Raw values of FAULT_Inject."""
-        return {
-            "FaultTarget": TARGETS[self.NODE],
-            "FaultKind": self.CODE,
-            "FaultCanId": codec.message(self.MESSAGE).can_id if self.MESSAGE else 0,
-            "FaultCount": 1,
-            "FaultParam": step % 65536,
-        }
+    def report(self, step: int) -> Frame:
+        """FAULT_Inject of this sampling instant."""
+        can_id = codec.message(self.MESSAGE).can_id if self.MESSAGE else 0
+        return report(self.CODE, TARGETS[self.NODE], step * STEP_SECONDS, can_id)

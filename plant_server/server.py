@@ -322,13 +322,13 @@ class PlantServer:
         ):  # what ends before what begins
             fault.act(self._pump, self.step)
             if fault.active(self.step):
-                frames.append(self._transmitter.frame("FAULT_Inject", **fault.report(self.step)))
+                frames.append(fault.report(self.step))
         return frames
 
     def _tell_sensor_faults(self) -> list[Frame]:
         """What was done to the newest sample on purpose."""
         faults = self._sensor.faults_acting
-        return [self._transmitter.frame("FAULT_Inject", **fault.report(self.step)) for fault in faults]
+        return [fault.report(self.step) for fault in faults]
 
     def _confirm_pump_alarms(self) -> list[Frame]:
         """The user confirms what the pump has shown since the last step."""
