@@ -1,11 +1,10 @@
-"""Shrunk cases that `pumpbench hunt` found; those still open are strict, so that whoever mends one has to say so."""
+"""Shrunk cases that `pumpbench hunt` found, kept when what they showed was mended."""
 
-import pytest
 from pumpbench import bench, faults
 
 
-@pytest.mark.xfail(strict=True, reason="open: H3, random bytes on the pump's side that pass for a heartbeat of a boot")
 def test_seed_1_case_6117() -> None:
+    """Random bytes pass for a boot of the device; the answer to the token that the plant repeats ends no other step."""
     outcome = bench.run(
         patient="adult#001",
         strategy="sma",

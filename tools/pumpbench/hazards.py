@@ -362,6 +362,7 @@ class Monitor:
         self._state: int | None = None
         self._lost_alarm = False
         self._phase: int = Phase.INIT
+        self._token = -1  # StepIndex of the newest token
         self.limiter_steps = 0
         self.diag: dict[str, int] | None = None
 
@@ -375,13 +376,15 @@ class Monitor:
                 continue
             check, name, values, _ = self._receiver.receive(frame)
             if check <= Check.OK_SOME_LOST:
+                if name == "SYNC_Done" and values["DoneStepIndex"] != self._token:
+                    continue  # an answer to an older token that was repeated: the step goes on
                 self._turn = name == "SYNC_Step" or (self._turn and name != "SYNC_Done")
                 getattr(self, f"_on_{name.lower()}")(values)
 
     # ---- what the device was told
 
     def _on_sync_step(self, values: dict[str, int]) -> None:
-        self._phase = values["SyncPhase"]
+        self._phase, self._token = values["SyncPhase"], values["StepIndex"]
         if self._phase in (Phase.STEP, Phase.CONTINUE):
             self._step = self.hazards.step = values["StepIndex"]
 
