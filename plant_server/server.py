@@ -93,7 +93,7 @@ class PlantServer:
         self._pump_faults = [fault for fault in run.faults if isinstance(fault, PumpFault)]
         sensor_faults = tuple(fault for fault in run.faults if isinstance(fault, Effect))
         self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name, sensor_faults)
-        self._pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
+        self.pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
         self._user = User(run.scenario, run.mode, run.seed, run.patient.name)
         self._outbox: list[Frame] = []
         self._echoes: dict[int, int] = {}
@@ -128,9 +128,9 @@ class PlantServer:
         if check > Check.OK_SOME_LOST:
             return ()
         if name == "PUMP_BasalCmd":
-            self._outbox += self._pump.command(values, self.step, self._transmitter)
+            self._outbox += self.pump.command(values, self.step, self._transmitter)
         elif name == "PUMP_BolusCmd":
-            self._outbox += self._pump.bolus(values, self.step, self._transmitter)
+            self._outbox += self.pump.bolus(values, self.step, self._transmitter)
         elif name == "HB_CTRL":
             return self._hear_heartbeat(values)
         elif name == "SYNC_Done":
@@ -237,7 +237,7 @@ class PlantServer:
         frames += self._fail_on_purpose()
         if not last:
             frames += self._user.announce(self.step, self._patient.rescued, self._transmitter)
-        frames += self._pump.report_alarms(self._transmitter)
+        frames += self.pump.report_alarms(self._transmitter)
         reading = self._read_sensor()
         frames += self._tell_sensor_faults()
         frames += self._sensor_status()
@@ -246,8 +246,8 @@ class PlantServer:
         frames += regular.frames(
             [
                 *reading,
-                *self._pump.values(),
-                *self._pump.heartbeat(),
+                *self.pump.values(),
+                *self.pump.heartbeat(),
                 toggle,
                 toggle,
                 *self._truth(),
@@ -265,8 +265,8 @@ class PlantServer:
         self._advance()
 
     def _advance(self) -> None:
-        insulin, pramlintide = self._pump.deliver(self.step)
-        for chamber in (self._pump.insulin, self._pump.pramlintide):
+        insulin, pramlintide = self.pump.deliver(self.step)
+        for chamber in (self.pump.insulin, self.pump.pramlintide):
             if not mechanism.ledger_closes(chamber.words):
                 raise PlantError(f"the pump's ledger does not close in step {self.step}: {chamber.words.tolist()}")
         self._patient.advance(self.step, insulin, pramlintide)
@@ -315,12 +315,12 @@ class PlantServer:
         if not self._pump_faults:
             return []
         frames = []
-        self._pump.insulin.mend()
-        self._pump.pramlintide.mend()
+        self.pump.insulin.mend()
+        self.pump.pramlintide.mend()
         for fault in sorted(
             self._pump_faults, key=lambda fault: fault.active(self.step)
         ):  # what ends before what begins
-            fault.act(self._pump, self.step)
+            fault.act(self.pump, self.step)
             if fault.active(self.step):
                 frames.append(fault.report(self.step))
         return frames
@@ -333,8 +333,8 @@ class PlantServer:
     def _confirm_pump_alarms(self) -> list[Frame]:
         """The user confirms what the pump has shown since the last step."""
         frames = []
-        for instance in self._pump.pending_alarms():
-            self._pump.acknowledge(instance)
+        for instance in self.pump.pending_alarms():
+            self.pump.acknowledge(instance)
             frames.append(
                 self._transmitter.frame("UI_AlarmAck", AlarmAckNode=2, AlarmAckAction=1, AlarmAckInstance=instance)
             )
@@ -348,8 +348,8 @@ class PlantServer:
             number, _raw(body.plasma_insulin / PMOL_PER_L_PER_MU_PER_L, 0.02), _raw(body.plasma_pramlintide, 0.02),
             number, _raw(body.eta, 0.0001), _raw(body.q_sto, 4.0),
             number, _raw(body.rate_of_appearance, 0.001), _raw(body.carbs_starting(self.step), 0.02),
-            number, *_ledger(self._pump.insulin.words),
-            number, *_ledger(self._pump.pramlintide.words),
+            number, *_ledger(self.pump.insulin.words),
+            number, *_ledger(self.pump.pramlintide.words),
         ]  # fmt: skip
 
 

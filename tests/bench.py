@@ -1,115 +1,36 @@
-"""A firmware on the bench without a bus: frames in by hand, decoded answers out.
+"""The reference firmware on the bench of `pumpbench.conformance.driver`, without a bus."""
 
-    bench = Bench()                     # roll call, calibration of adult#001, mode nma
-    turn = bench.step(glucose=1500)     # one sampling instant: CGM, pump status and totals, token
-    assert turn.state == State.AUTO and turn.command["InsulinRate"] > 0
+from pumpbench.conformance.driver import (
+    GLUCOSE,
+    NMA,
+    SENT_BY_CTRL,
+    SIM_TIME_SNA,
+    Turn,
+    calibration,
+)
+from pumpbench.conformance.driver import Bench as Driver
 
-Every turn is held against the rules of the lockstep and of E2E: nothing is said out of turn, every frame of CTRL has a
-good CRC and the next counter, SYNC_Done is the last one and counts the others. The pump on the bench obeys to the mU.
-"""
-
-import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-
-from pumpbench.calibration import calibrate
-
-import dbc
-from can_bus import codec
-from can_bus.codec import Check, Receiver, Transmitter
-from can_bus.frame import Frame
-from can_bus.lockstep import STEP_SECONDS, Done, Node, Phase
+from can_bus.lockstep import Node
 from firmware_sim.firmware import Firmware
-from firmware_sim.ladder import State
-from firmware_sim.pump import Op
-from plant_server.physiology import load_patient
 
-MODE_OFF, OPEN_LOOP, NMA, S2 = 0, 1, 2, 6
+__all__ = [
+    "GLUCOSE",
+    "MODE_OFF",
+    "NMA",
+    "OPEN_LOOP",
+    "S2",
+    "SENT_BY_CTRL",
+    "SIM_TIME_SNA",
+    "Bench",
+    "Turn",
+    "calibration",
+]
 
-GLUCOSE = 1200
-"""0.1 mg/dL, the target of all adults: a firmware at rest asks for its schedule."""
-
-SIM_TIME_SNA = 268435455
-"""SimTime of the steps after 8.5 years, which it cannot hold."""
-
-SENT_BY_CTRL = tuple(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
-
-
-@functools.cache
-def _calibration(patient: str) -> tuple[tuple[int, int], ...]:
-    return tuple(calibrate(load_patient(patient)).items())
+MODE_OFF, OPEN_LOOP, S2 = 0, 1, 6
 
 
-def calibration(patient: str = "adult#001", **raws: int) -> dict[int, int]:
-    """The calibration of a patient, index -> raw value with the CRC last; `raws` by signal name change it."""
-    from firmware_sim.calibration import SET_CRC_INDEX, parameter_names, set_crc
-
-    index = {name: number for number, name in parameter_names().items()}
-    values = dict(_calibration(patient)) | {index[name]: raw for name, raw in raws.items()}
-    del values[SET_CRC_INDEX]
-    values[SET_CRC_INDEX] = set_crc(values)
-    return values
-
-
-@dataclass
-class Turn:
-    """What the firmware said in one turn."""
-
-    frames: list[Frame]
-    said: list[tuple[str, dict[str, int]]] = field(default_factory=list)  # message name, raw values; in order
-
-    def all(self, name: str) -> list[dict[str, int]]:
-        """The frames of one message."""
-        return [values for said, values in self.said if said == name]
-
-    def one(self, name: str) -> dict[str, int]:
-        """The only frame of one message."""
-        (values,) = self.all(name)
-        return values
-
-    def alarms(self, code: int) -> list[dict[str, int]]:
-        """The alarm frames of one code."""
-        return [alarm for alarm in self.all("CTRL_Alarm") if alarm["CtrlAlarmCode"] == code]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all frames in order."""
-        return [name for name, _ in self.said]
-
-    @property
-    def done(self) -> dict[str, int]:
-        """SYNC_Done."""
-        return self.one("SYNC_Done")
-
-    @property
-    def command(self) -> dict[str, int]:
-        """PUMP_BasalCmd."""
-        return self.one("PUMP_BasalCmd")
-
-    @property
-    def rate(self) -> int:
-        """The commanded insulin rate, 0.005 U/h; a set-point must have been sent."""
-        assert self.command["BasalOp"] == Op.SET_RATE
-        return self.command["InsulinRate"]
-
-    @property
-    def status(self) -> dict[str, int]:
-        """CTRL_Status."""
-        return self.one("CTRL_Status")
-
-    @property
-    def state(self) -> State:
-        """CTRL_Status.CtrlState."""
-        return State(self.status["CtrlState"])
-
-    @property
-    def diag(self) -> dict[str, int]:
-        """CTRL_Diag."""
-        return self.one("CTRL_Diag")
-
-
-class Bench:
-    """The other end of a firmware's wire: roll call, calibration, sensor, pump, user and time."""
+class Bench(Driver):
+    """As the driver, with the built-in firmware if none is given."""
 
     def __init__(
         self,
@@ -120,176 +41,4 @@ class Bench:
         firmware: Node | None = None,
         start: bool = True,
     ) -> None:
-        """Put a firmware on the bench.
-
-        Args:
-            patient: whose calibration to flash.
-            mode: CtrlMode to ask for.
-            flash: another calibration; {} for none at all.
-            firmware: to test; the built-in one if None.
-            start: call the roll and flash; otherwise the caller does.
-        """
-        self.firmware: Node = firmware or Firmware()
-        self.flash = calibration(patient) if flash is None else flash
-        self.basal = self.flash.get(0, 0)  # 0.001 U/h
-        self.log: list[Frame] = []  # everything on the bus, both directions, in order
-        self.k = 0  # the next step
-        self.total = 0  # 1/12 mU delivered
-        self.pram_total = 0  # 1/12 of 0.01 ug
-        self.boot_count = 0
-        self._rate = self.basal  # 0.001 U/h, what the pump is doing
-        self._pram_rate = 0  # 0.01 ug/h
-        self._calls = 0
-        self._roll = Transmitter()
-        self.transmitter = Transmitter()
-        self.receiver = Receiver(SENT_BY_CTRL)
-        if start:
-            self.call_roll()
-            self.configure(self.flash, mode)
-
-    # ---- frames
-
-    def frame(self, name: str, **values: int) -> Frame:
-        """Build a frame of any node but CTRL; its counter goes on even if the frame is never sent."""
-        return self.transmitter.frame(name, **values)
-
-    def give(self, *frames: Frame) -> None:
-        """Frames for the firmware to hear; it must keep silent, for it is not its turn."""
-        for frame in frames:
-            self.log.append(frame)
-            assert not self.firmware.receive(frame), "spoke out of turn"
-
-    def send(self, name: str, **values: int) -> None:
-        """Build a frame and give it."""
-        self.give(self.frame(name, **values))
-
-    def token(self, phase: int, step: int, time: int = 0) -> Turn:
-        """Give the turn and hear what is said."""
-        return self.hand_over(self.frame("SYNC_Step", SyncPhase=phase, StepIndex=step, SimTime=time), step)
-
-    def hand_over(self, token: Frame, step: int) -> Turn:
-        """Give the turn with a frame of one's own."""
-        self.log.append(token)
-        return self.check(self.listen(self.firmware.receive(token)), step)
-
-    def check(self, turn: Turn, step: int) -> Turn:
-        """Whether a turn is closed as it should be."""
-        assert turn.names, "no answer to the token"
-        assert turn.names[-1] == "SYNC_Done", turn.names
-        assert turn.done["DoneStepIndex"] == step
-        assert turn.done["TxCount"] == len(turn.frames)
-        return turn
-
-    def listen(self, frames: Sequence[Frame]) -> Turn:
-        """Check and decode what the firmware said."""
-        turn = Turn(list(frames))
-        for frame in frames:
-            check, name, values, _ = self.receiver.receive(frame)
-            assert check == Check.OK, (name, check, frame)
-            turn.said.append((name, values))
-        self.log += frames
-        return turn
-
-    # ---- the run
-
-    def call_roll(self, version: tuple[int, int] | None = None) -> Turn:
-        """Call the roll until it is answered; the counters of both sides start anew after it.
-
-        In the middle of a run the first call comes with a counter the firmware did not expect.
-        """
-        major, minor = version or dbc.protocol_version()
-        for _ in range(3):
-            self._calls += 1
-            self.give(
-                self._roll.frame(
-                    "PLANT_Info", PlantProtocolMajor=major, PlantProtocolMinor=minor, PlantDbcCrc=dbc.crc32()
-                )
-            )
-            token = self._roll.frame("SYNC_Step", SyncPhase=Phase.INIT, StepIndex=self._calls, SimTime=0)
-            self.log.append(token)
-            answer = self.firmware.receive(token)
-            if answer:
-                break
-        self.receiver = Receiver(SENT_BY_CTRL)
-        turn = self.check(self.listen(answer), self._calls)
-        self.transmitter, self.receiver = Transmitter(), Receiver(SENT_BY_CTRL)
-        return turn
-
-    def configure(self, flash: dict[int, int], mode: int | None = None) -> Turn:
-        """Flash parameters, ask for a mode, and give the turn for it."""
-        names = codec.message("CFG_Param").pages
-        for index, raw in flash.items():
-            self.send("CFG_Param", CfgIndex=index, **{names[index][0].name: raw})
-        if mode is not None:
-            self.send("MODE_Cmd", ModeRequest=mode, ModeCmdSeq=0, SuspendRequest=0)
-        turn = self.token(Phase.CONFIG, 0)
-        assert turn.done["DoneStatus"] == Done.OK
-        return turn
-
-    def sample(self, glucose: int = GLUCOSE, **values: int) -> Frame:
-        """CGM_Reading of the step to come, or with fields of one's own."""
-        fields = {
-            "CgmState": 1,
-            "GlucoseConc": glucose,
-            "CgmSampleSeq": self.k % 65535,
-            "CgmSampleStep": self.k % 256,
-        }
-        return self.frame("CGM_Reading", **(fields | values))
-
-    def status(self) -> Frame:
-        """PUMP_Status of the step to come."""
-        return self.frame("PUMP_Status", PumpState=3, InsulinReservoir=2000, PramReservoir=2000, PumpBattery=90)
-
-    def delivered(self, **values: int) -> Frame:
-        """PUMP_Delivered of the step to come, or with fields of one's own."""
-        totals = {"InsulinTotal": self.total // 12, "PramTotal": self.pram_total // 12}
-        fields = {"PumpBootCount": self.boot_count, **totals}
-        return self.frame("PUMP_Delivered", **(fields | values))
-
-    def step(
-        self,
-        glucose: int = GLUCOSE,
-        *,
-        cgm: Sequence[Frame] | None = None,
-        drop: bool = False,
-        status: bool = True,
-        totals: Frame | bool = True,
-        also: Sequence[Frame] = (),
-    ) -> Turn:
-        """One sampling instant and the five minutes after it.
-
-        Args:
-            glucose: 0.1 mg/dL, what the sensor says.
-            cgm: what arrives of the sensor instead.
-            drop: the sensor's frame is lost on its way.
-            status: whether the pump's status arrives.
-            totals: PUMP_Delivered, or whether it arrives.
-            also: further frames before the token.
-        """
-        if cgm is None:
-            sample = self.sample(glucose)
-            cgm = () if drop else (sample,)
-        state = self.status()
-        total = self.delivered() if isinstance(totals, bool) else totals
-        frames = [*cgm, *([state] if status else ()), *([total] if totals is not False else ()), *also]
-        self.give(*frames)
-        turn = self.token(Phase.STEP, self.k, min(self.k * STEP_SECONDS, SIM_TIME_SNA))
-        self.obey(turn)
-        self.k += 1
-        return turn
-
-    def obey(self, turn: Turn) -> None:
-        """The pump takes the commands of a turn, and runs for five minutes."""
-        for command in turn.all("PUMP_BasalCmd"):
-            rates = {Op.SET_RATE: command["InsulinRate"] * 5, Op.SUSPEND: 0, Op.RESUME_SCHEDULE: self.basal}
-            self._rate = rates[Op(command["BasalOp"])]
-            self._pram_rate = command["PramlintideRate"] * 10 if command["BasalOp"] == Op.SET_RATE else 0
-        self.total += self._rate
-        self.pram_total += self._pram_rate
-
-    def run(self, steps: int, glucose: int = GLUCOSE) -> Turn:
-        """Several undisturbed steps; the last one's turn."""
-        assert steps > 0
-        for _ in range(steps):
-            turn = self.step(glucose)
-        return turn
+        super().__init__(firmware or Firmware(), patient=patient, mode=mode, flash=flash, start=start)

@@ -238,7 +238,7 @@ def test_a_reset_of_the_pump_is_told_in_its_totals_and_heartbeat() -> None:
 
     delivered, heartbeat = told()
     assert (delivered["PumpBootCount"], heartbeat["NmtPump"], heartbeat["BootPump"]) == (0, 5, 0)
-    device.plant._pump.reset()
+    device.plant.pump.reset()
     device.step()
     delivered, heartbeat = told()
     assert (delivered["PumpBootCount"], heartbeat["NmtPump"], heartbeat["BootPump"]) == (1, 0, 1)

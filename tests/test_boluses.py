@@ -124,7 +124,7 @@ def test_a_refused_meal_gives_neither_drug() -> None:
 def test_the_pumps_own_limit_is_respected() -> None:
     """Its refusal ends the meal's other drug too, and the next bolus is within it (requirement CMD-07)."""
     pair = Pair("s3", [(20, 60.0), (30, 60.0)], steps=40)
-    pair.plant._pump.boluses[INSULIN].max_raw = 200
+    pair.plant.pump.boluses[INSULIN].max_raw = 200
     pair.play()
     assert list(pair.commits(INSULIN).values()) == [200]
     assert len(pair.commits(PRAMLINTIDE)) == 1
@@ -356,7 +356,7 @@ def test_a_reset_pump_voids_what_was_programmed_and_totals_start_anew() -> None:
     def wire(name: str, _values: Values, _frame: Frame) -> None:
         if name == "SYNC_Step" and pair.plant.step == 23 and not resets:
             resets.append(23)
-            pair.plant._pump.reset()
+            pair.plant.pump.reset()
 
     pair.to_device = wire
     pair.play()
@@ -382,7 +382,7 @@ def test_five_resets_in_an_hour_hold_the_schedule() -> None:
 
 def test_a_pump_that_accepts_no_bolus_at_all_is_asked_once_and_then_told_as_limited() -> None:
     pair = Pair("ma", meals=[(10, 60.0), (30, 60.0)], steps=40)
-    pair.plant._pump.boluses[INSULIN].max_raw = 0
+    pair.plant.pump.boluses[INSULIN].max_raw = 0
     pair.play()
     programs = [values for values in pair.all("PUMP_BolusCmd") if values["BolusOp"] == 1]
     assert {values["BolusId"] for values in programs} == {0}

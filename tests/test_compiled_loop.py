@@ -76,7 +76,7 @@ class Watched(PlantServer):
             self.acks.add((AckFor(values["AckFor"]), AckResult(values["AckResult"])))
 
     def _advance(self) -> None:
-        body, insulin, pramlintide = self._patient, self._pump.insulin, self._pump.pramlintide
+        body, insulin, pramlintide = self._patient, self.pump.insulin, self.pump.pramlintide
         self.floats.append((body.glucose, body.plasma_insulin, body.plasma_pramlintide))
         before = insulin.delivered, pramlintide.delivered
         super()._advance()

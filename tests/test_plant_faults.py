@@ -175,11 +175,11 @@ class Watched(PlantServer):
 
     def __init__(self, run: Any) -> None:
         super().__init__(run)
-        self.words = [self._pump.insulin.words.copy()]
+        self.words = [self.pump.insulin.words.copy()]
 
     def _advance(self) -> None:
         super()._advance()
-        self.words.append(self._pump.insulin.words.copy())
+        self.words.append(self.pump.insulin.words.copy())
 
 
 def play(*faults: Any, mode: str = "ma", hours: int = 5, sensor: str = "coloured") -> tuple[bench.Outcome, np.ndarray]:

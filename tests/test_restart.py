@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from pair import MODES
+from pumpbench.calibration import MODES
 
 from firmware_sim.__main__ import main, memory
 from firmware_sim.firmware import Cause, Firmware

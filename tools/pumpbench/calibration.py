@@ -4,6 +4,7 @@ This is the tool on the clinic's PC, not the pump: it may use floats. The firmwa
 index, and a CRC over the set.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from can_bus import codec
@@ -112,9 +113,13 @@ def calibrate(patient: Patient, tuning: Tuning | None = None, model: ControllerM
         "CfgStuckSamples": tuning.stuck_samples,
         **_coefficients(tuning, model),
     }
-    raws = {index: _raw(name, physical[name]) for index, name in _indices().items() if name in physical}
-    raws[SET_CRC_INDEX] = set_crc(raws)
-    return raws
+    return with_crc({index: _raw(name, physical[name]) for index, name in _indices().items() if name in physical})
+
+
+def with_crc(raws: Mapping[int, int]) -> dict[int, int]:
+    """A set of raw values by CfgIndex, with its CRC as the last one (a CRC already there is replaced)."""
+    values = {index: raw for index, raw in raws.items() if index != SET_CRC_INDEX}
+    return {**values, SET_CRC_INDEX: set_crc(values)}
 
 
 def _coefficients(tuning: Tuning, model: ControllerModel) -> dict[str, float]:

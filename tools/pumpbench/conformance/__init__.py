@@ -1,0 +1,1 @@
+"""Numbered requirements, checked against any firmware over any bus: `pumpbench conformance`."""

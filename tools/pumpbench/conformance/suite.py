@@ -1,0 +1,216 @@
+"""Run the checks against a device and say of every requirement what came of it."""
+
+import enum
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, get_args
+
+from can_bus import codec
+from can_bus.frame import Frame
+from plant_server.server import PlantError
+from pumpbench.calibration import MODES
+from pumpbench.conformance.device import Device
+from pumpbench.conformance.driver import Bench, Silent, Violation
+from pumpbench.conformance.registry import Check, Dut, Need, checks
+from pumpbench.conformance.requirements import Requirement, requirements
+from pumpbench.conformance.settings import Settings
+
+BOLUSES: tuple[Need, ...] = ("sma", "ma", "s1", "s2", "s3", "s4")
+PRAMLINTIDE: tuple[Need, ...] = ("s1", "s2", "s3", "s4")
+
+TESTER_PRESENT = bytes.fromhex("023E00").ljust(8, b"\xcc")
+"""UDS TesterPresent in a single frame of ISO-TP: whoever has a server answers."""
+
+
+class Verdict(enum.Enum):
+    """What came of one requirement."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    NOT_APPLICABLE = "not applicable"
+    ELSEWHERE = "tested elsewhere"
+    OPEN = "not checked"
+    NOT_RUN = "not run"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One requirement and its verdict.
+
+    Attributes:
+        text: why, in words; empty where it passed.
+        seconds: of wall clock.
+        frames: those on the device's bus in the check, where it failed.
+    """
+
+    requirement: Requirement
+    verdict: Verdict
+    text: str = ""
+    seconds: float = 0.0
+    frames: Sequence[Frame] = ()
+
+
+class Report(NamedTuple):
+    """All results, in the order of the catalogue, and what the device can do."""
+
+    results: list[Result]
+    offers: frozenset[Need]
+
+    def of(self, verdict: Verdict) -> list[Result]:
+        """The results with one verdict."""
+        return [each for each in self.results if each.verdict == verdict]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every requirement that was asked about is met or does not apply."""
+        return not self.of(Verdict.FAILED) and not self.of(Verdict.NOT_RUN)
+
+
+class NobodyThere(RuntimeError):
+    """The device never answered a roll call."""
+
+
+def select(names: Iterable[str]) -> list[Requirement]:
+    """The requirements of these ids or groups of ids (`SEN-01`, `SEN`), in the order of the catalogue.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    asked = list(names)
+    for name in asked:
+        if not any(known == name or known.startswith(f"{name}-") for known in requirements()):
+            groups = ", ".join(dict.fromkeys(known[:3] for known in requirements()))
+            raise ValueError(f"there is no requirement {name!r}; give ids such as SEN-01 or groups of {groups}")
+    return [
+        each
+        for each in requirements().values()
+        if not asked or any(each.id in (n, f"{n}-{each.id[4:]}") for n in asked)
+    ]
+
+
+def run(
+    device: Device,
+    settings: Settings,
+    *,
+    wanted: Sequence[Requirement] | None = None,
+    memory: bool = True,
+    long: bool = False,
+    patience: float = 10.0,
+    progress: Callable[[int, int], None] = lambda _done, _of: None,
+) -> Report:
+    """Check a device.
+
+    Args:
+        device: what is tested.
+        settings: thresholds.
+        wanted: the requirements to check; default: all.
+        memory: whether the device's memory can be lost or torn at a restart.
+        long: use the long form of checks that have one.
+        patience: seconds to wait for the first answer.
+        progress: called with the number of requirements done and of all.
+
+    Raises:
+        NobodyThere: the device never answered.
+        BusLost: the bus is gone.
+    """
+    wanted = list(requirements().values()) if wanted is None else wanted
+    _await(device, patience)
+    dut = Dut(device, settings, _offers(device, memory=memory), long=long)
+    results: list[Result] = []
+    gone = ""
+    for number, requirement in enumerate(wanted):
+        progress(number, len(wanted))
+        found = checks().get(requirement.id)
+        if gone and found is not None:
+            results.append(Result(requirement, Verdict.NOT_RUN, gone))
+            continue
+        result = _without_check(requirement) if found is None else judge(dut, requirement, found)
+        results.append(result)
+        if result.verdict == Verdict.FAILED and not _revive(device):
+            gone = f"since {requirement.id} the device answers nothing"
+    progress(len(wanted), len(wanted))
+    return Report(results, dut.offers)
+
+
+def _await(device: Device, patience: float) -> None:
+    over = time.monotonic() + patience
+    while True:
+        try:
+            device.renew()
+            Bench(device, start=False).call_roll()
+        except Silent as silent:
+            if time.monotonic() > over:
+                raise NobodyThere(f"nobody answers the roll call on this bus: {silent}") from silent
+        except Violation:
+            return  # somebody is there, though it breaks rules: the checks say which
+        else:
+            return
+
+
+def _revive(device: Device) -> bool:
+    """Whether the device still answers after a failed check, if need be once it was started anew."""
+    for restart in (False, True):
+        if restart and not device.can_restart:
+            return False
+        try:
+            if restart:
+                device.restart()
+            device.renew()
+            Bench(device, start=False).call_roll()
+        except Silent:
+            continue
+        except Violation:
+            return True
+        return True
+    return False
+
+
+def _offers(device: Device, *, memory: bool) -> frozenset[Need]:
+    """What the device can do, by trying: modes it takes up, restarts, UDS."""
+    found: set[Need] = set()
+    for name in get_args(Need):
+        if name in MODES and _takes_up(device, MODES[name]):
+            found.add(name)
+    if found.intersection(BOLUSES):
+        found.add("boluses")
+    if found.intersection(PRAMLINTIDE):
+        found.add("pramlintide")
+    if device.can_restart:
+        found.add("restart")
+        if memory:
+            found.add("memory")
+    try:
+        if device.receive(Frame(codec.message("UDS_Request").can_id, TESTER_PRESENT)):
+            found.add("uds")
+    except Violation:
+        pass  # it talks out of turn: the checks say so
+    return frozenset(found)
+
+
+def _takes_up(device: Device, mode: int) -> bool:
+    try:
+        device.renew()
+        return Bench(device, mode=mode).step().status["CtrlMode"] == mode
+    except Violation:
+        return mode == MODES["nma"]  # the mode every device has to have: its checks tell what is wrong
+
+
+def _without_check(requirement: Requirement) -> Result:
+    if requirement.evidence is not None:
+        return Result(requirement, Verdict.ELSEWHERE, requirement.evidence)
+    return Result(requirement, Verdict.OPEN, requirement.open or "no check is written yet")
+
+
+def judge(dut: Dut, requirement: Requirement, found: Check) -> Result:
+    """Run one check."""
+    missing = [need for need in found.needs if need not in dut.offers]
+    if missing:
+        return Result(requirement, Verdict.NOT_APPLICABLE, f"needs {', '.join(missing)}")
+    began = time.monotonic()
+    try:
+        found.run(dut)
+    except (Violation, PlantError) as error:
+        took = time.monotonic() - began
+        return Result(requirement, Verdict.FAILED, f"expected {error}", took, list(dut.record()))
+    return Result(requirement, Verdict.PASSED, "", time.monotonic() - began)
