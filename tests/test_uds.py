@@ -373,7 +373,7 @@ def test_no_request_changes_a_frame(strategy: str, seed: int, frames: list[bytes
         def watch(arrived: list[Frame], heard: list[Frame] = heard) -> None:
             heard += arrived
 
-        give = pair._give
+        give = pair.give
 
         def disturbed(frame: Frame, give=give, pair=pair, generator=generator) -> list[Frame]:  # type: ignore[no-untyped-def]
             for _ in range(generator.randrange(4)):
@@ -383,7 +383,7 @@ def test_no_request_changes_a_frame(strategy: str, seed: int, frames: list[bytes
 
         pair.watch = watch  # type: ignore[assignment]
         if tested:
-            pair._give = disturbed  # type: ignore[method-assign]
+            pair.give = disturbed  # type: ignore[method-assign]
         pair.play()
         said.append(heard)
     assert said[0] == said[1]

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from pumpbench import __version__
+from pumpbench.cli_conformance import conformance
 from pumpbench.cli_faults import faults_command, hunt, matrix
 from pumpbench.terminal import (
     EXIT_DEAD,
@@ -459,6 +460,7 @@ def convert(
 app.command(name="faults")(faults_command)
 app.command()(matrix)
 app.command()(hunt)
+app.command()(conformance)
 
 
 class Interrupted(Exception):

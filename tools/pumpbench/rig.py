@@ -526,7 +526,7 @@ def _processes(prepared: Prepared) -> Path:
         nvm = place / "nvm"
 
         def launch(memory: MemoryState) -> Child:
-            command = _firmware_command(request, buses.device, nvm if ours else None, memory)
+            command = firmware_command(request.firmware, buses.device, nvm if ours else None, memory)
             return start("firmware", command, ready=False)
 
         firmware = None if request.firmware == SOMEBODY_ELSES else Process(launch, nvm)
@@ -590,8 +590,19 @@ def _start_recorder_side(
     return start("recorder", command, ready=True)
 
 
-def _firmware_command(request: Request, device_url: str, nvm: Path | None, memory: MemoryState) -> list[str]:
-    if request.firmware is None:
+def firmware_command(firmware: str | None, device_url: str, nvm: Path | None, memory: MemoryState) -> list[str]:
+    """The command that starts a device.
+
+    Args:
+        firmware: somebody's command, with places `{bus}` and `{nvm}`; None for the reference firmware.
+        device_url: the device's bus.
+        nvm: the file of its memory, if it has one.
+        memory: what has become of it.
+
+    Raises:
+        RigError: the command is empty.
+    """
+    if firmware is None:
         command = [sys.executable, "-m", "firmware_sim", "--bus", device_url]
         if nvm is not None:
             command += ["--nvm", str(nvm), "--reset-cause", "power_on" if memory == "kept" else "brown_out"]
@@ -599,7 +610,7 @@ def _firmware_command(request: Request, device_url: str, nvm: Path | None, memor
     places = {"{bus}": device_url, "{nvm}": str(nvm or "")}
     command = [
         functools.reduce(lambda text, place: text.replace(*place), places.items(), part)
-        for part in shlex.split(request.firmware)
+        for part in shlex.split(firmware)
     ]
     if not command:
         raise RigError("--firmware is empty; give the command that starts it, {bus} stands for the bus URL")

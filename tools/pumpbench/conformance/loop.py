@@ -13,7 +13,7 @@ from typing import Self
 
 from can_bus import codec
 from can_bus.frame import Frame
-from can_bus.lockstep import Node
+from can_bus.lockstep import Node, Phase
 from plant_server import mechanism
 from plant_server.physiology import Patient, load_patient
 from plant_server.scenario import Meal, Scenario, load_scenario
@@ -77,6 +77,8 @@ class Loop:
     def play(self) -> Self:
         """To the end of the run; returns the loop.
 
+        The device is not told of the end: a process would leave, and the next check needs it.
+
         Raises:
             Silent: the device did not answer.
             PlantError: it broke the protocol in a way the plant does not bear.
@@ -90,6 +92,8 @@ class Loop:
                 calls += 1  # one whose counters are those of an earlier run misses the first call
                 to_device += self.plant.call_roll()
             frame = to_device.popleft()
+            if self._is_end(frame):
+                break
             answers: list[Frame] = []
             self.watch_pump([frame])
             for arrived in self._carry(self.to_device, frame):
@@ -102,6 +106,11 @@ class Loop:
                     self.watch_pump([arrived])
                     to_device += self.plant.receive(arrived)
         return self
+
+    @staticmethod
+    def _is_end(frame: Frame) -> bool:
+        token = codec.message("SYNC_Step")
+        return frame.can_id == token.can_id and token.unpack(frame.data)["SyncPhase"] == Phase.END
 
     def _carry(self, wire: Wire, frame: Frame) -> Sequence[Frame]:
         message = codec.messages_by_id().get(frame.can_id)

@@ -96,6 +96,7 @@ def run(
     wanted: Sequence[Requirement] | None = None,
     memory: bool = True,
     long: bool = False,
+    must: Iterable[str] = (),
     patience: float = 10.0,
     progress: Callable[[int, int], None] = lambda _done, _of: None,
 ) -> Report:
@@ -107,6 +108,7 @@ def run(
         wanted: the requirements to check; default: all.
         memory: whether the device's memory can be lost or torn at a restart.
         long: use the long form of checks that have one.
+        must: modes that it has to take up, whether or not it does.
         patience: seconds to wait for the first answer.
         progress: called with the number of requirements done and of all.
 
@@ -116,7 +118,7 @@ def run(
     """
     wanted = list(requirements().values()) if wanted is None else wanted
     _await(device, patience)
-    dut = Dut(device, settings, _offers(device, memory=memory), long=long)
+    dut = Dut(device, settings, _offers(device, must, memory=memory), long=long)
     results: list[Result] = []
     gone = ""
     for number, requirement in enumerate(wanted):
@@ -166,12 +168,12 @@ def _revive(device: Device) -> bool:
     return False
 
 
-def _offers(device: Device, *, memory: bool) -> frozenset[Need]:
+def _offers(device: Device, must: Iterable[str], *, memory: bool) -> frozenset[Need]:
     """What the device can do, by trying: modes it takes up, restarts, UDS."""
-    found: set[Need] = set()
-    for name in get_args(Need):
-        if name in MODES and _takes_up(device, MODES[name]):
-            found.add(name)
+    asked = set(must)
+    found: set[Need] = {
+        name for name in get_args(Need) if name in MODES and (name in asked or _takes_up(device, MODES[name]))
+    }
     if found.intersection(BOLUSES):
         found.add("boluses")
     if found.intersection(PRAMLINTIDE):

@@ -1,0 +1,107 @@
+"""Bring up the device under test: in this process, as a process on a hub of its own, or where somebody has put it."""
+
+import contextlib
+import os
+import shlex
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from can_bus.faults.nodes import MemoryState
+from can_bus.hub import Hub
+from can_bus.link import Link
+from can_bus.url import open_link
+from pumpbench.conformance.device import Device, Remote
+from pumpbench.rig import SOMEBODY_ELSES, Child, NodeDied, RigError, firmware_command
+
+RESET_SECONDS = 30.0
+"""How long a command that resets a device may take."""
+
+
+@contextlib.contextmanager
+def connected(
+    bus: str = "inproc",
+    firmware: str | None = None,
+    *,
+    timeout: float = 5.0,
+    reset_hook: str | None = None,
+) -> Iterator[tuple[Device, bool]]:
+    """A device, and whether its memory can be lost or torn from outside.
+
+    Args:
+        bus: `inproc`, `hub`, or the URL of the device's bus.
+        firmware: the command that starts it; None for the reference; "none" for a device that runs by itself.
+        timeout: seconds to wait for the end of a turn.
+        reset_hook: command that resets a device which runs by itself.
+
+    Raises:
+        RigError: these do not go together.
+        BusUrlError, CanInitializationError: the bus cannot be opened.
+    """
+    if bus == "inproc":
+        if firmware is not None:
+            raise RigError("--bus inproc is the reference firmware in this process; for another one give --bus hub")
+        from pumpbench.conformance.reference import reference  # noqa: PLC0415
+
+        yield reference(), True
+        return
+    if bus == "hub" and firmware == SOMEBODY_ELSES:
+        raise RigError("a device that runs by itself needs the bus it is on: give its URL with --bus")
+    with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory, contextlib.ExitStack() as stack:
+        place = Path(directory)
+        url = f"unix:{place / 'bus.sock'}" if bus == "hub" else bus
+        if bus == "hub":
+            stack.enter_context(Hub(url)).start()
+        link = stack.enter_context(open_link(url))
+        if firmware == SOMEBODY_ELSES:
+            restart = None if reset_hook is None else _hook(reset_hook, url)
+            yield Remote(link, timeout=timeout, restart=restart), False
+        else:
+            yield stack.enter_context(_started(link, url, firmware, place, timeout))
+
+
+@contextlib.contextmanager
+def _started(link: Link, url: str, firmware: str | None, place: Path, timeout: float) -> Iterator[tuple[Device, bool]]:
+    """A device as a child process, which has a memory where its command has a place for one."""
+    nvm = place / "nvm"
+    keeps = firmware is None or "{nvm}" in firmware
+    with (place / "firmware.log").open("ab") as log:
+
+        def launch(memory: MemoryState) -> Child:
+            command = firmware_command(firmware, url, nvm if keeps else None, memory)
+            return Child("firmware", command, os.environ | {"PUMPBENCH_BUS": url}, log, ready=False)
+
+        child = launch("kept")
+
+        def restart(memory: MemoryState) -> None:
+            nonlocal child
+            child.kill()
+            if memory == "lost":
+                nvm.unlink(missing_ok=True)
+            child = launch(memory)
+
+        def watch() -> None:
+            child.check()  # whichever it is by now
+
+        try:
+            yield Remote(link, timeout=timeout, watch=watch, restart=restart), keeps
+        finally:
+            child.end()
+
+
+def _hook(command: str, url: str) -> Callable[[MemoryState], None]:
+    def restart(_memory: MemoryState) -> None:
+        words = [word.replace("{bus}", url) for word in shlex.split(command)]
+        try:
+            done = subprocess.run(
+                words, timeout=RESET_SECONDS, check=False, stdin=subprocess.DEVNULL, capture_output=True, text=True
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise NodeDied(f"--reset-hook {command!r}: {error}") from error
+        if done.returncode != 0:
+            raise NodeDied(
+                f"--reset-hook {command!r} ended with status {done.returncode}: {done.stderr.strip()[-200:]}"
+            )
+
+    return restart
