@@ -227,10 +227,8 @@ class Boluses:
         self._listen()
         pramlintide = self._open.get(Drug.PRAMLINTIDE)
         if had_insulin and self.refused > refused and pramlintide is not None and not pramlintide.committed:
-            insulin = self._open.get(Drug.INSULIN)
-            if insulin is None or insulin.op == Op.CANCEL:
-                pramlintide.op = Op.CANCEL
-                pramlintide.sends = 0
+            pramlintide.op = Op.CANCEL
+            pramlintide.sends = 0
 
     def _listen(self) -> None:
         for drug in list(self._open):

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from firmware_sim.bolus import EXPIRES_AFTER, SENDS, Boluses, Drug, Op, Phase
+from firmware_sim.bolus import EXPIRES_AFTER, SENDS, STROKE, Boluses, Drug, Op, Phase
 from firmware_sim.pump import accepted_limit
 
 INSULIN, PRAMLINTIDE = Drug.INSULIN, Drug.PRAMLINTIDE
@@ -384,3 +384,46 @@ def test_a_bolus_that_goes_on_does_not_hold_up_the_other_drug() -> None:
 def test_what_is_stored_of_an_open_bolus() -> None:
     talk = committed()
     assert talk.boluses.save() == [1, 1, 0, 250, 10 + EXPIRES_AFTER, 1, 250, 0, 0, 0, 0, 0, 0]
+
+
+# ---- what is counted
+
+
+def test_every_command_without_an_answer_is_counted() -> None:
+    talk = Talk((INSULIN, 160), (PRAMLINTIDE, 300))
+    for count in (2, 4, 6):
+        assert talk.speak()
+        talk.boluses.listen()
+        assert talk.boluses.unanswered == count
+    assert talk.boluses.uncertain
+    assert not talk.speak()
+    talk.boluses.listen()
+    assert talk.boluses.unanswered == 6  # nothing was said
+
+
+@pytest.mark.parametrize(
+    ("phase", "left", "short"),
+    [
+        (Phase.DONE, 0, 0),
+        (Phase.DONE, STROKE - 1, 0),
+        (Phase.DONE, STROKE, STROKE),
+        (Phase.ABORTED, 60, 60),
+        (Phase.DELIVERING, 60, 0),
+    ],
+)
+def test_a_bolus_that_ended_early_is_short_by_the_rest(phase: Phase, left: int, short: int) -> None:
+    talk = Talk((INSULIN, 160))
+    for number in (0, 1):  # what was short before stays
+        talk.tell(INSULIN, phase, number, 160 - left)
+        talk.next()
+        assert talk.boluses.short == {INSULIN: (number + 1) * short, PRAMLINTIDE: 0}
+        assert not talk.boluses.uncertain
+        talk.boluses.start(INSULIN, 160, talk.step)
+
+
+def test_a_bolus_that_was_given_up_is_not_short() -> None:
+    talk = Talk((INSULIN, 160))
+    talk.boluses.cancel()
+    talk.tell(INSULIN, Phase.ABORTED, 0, 40)
+    talk.next()
+    assert talk.boluses.short == {INSULIN: 0, PRAMLINTIDE: 0}

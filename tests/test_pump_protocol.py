@@ -101,3 +101,124 @@ def test_a_bolus_the_pump_told_of_counts_although_its_total_is_missing() -> None
     assert pump.delivered(None, 1, BASAL, 1600) == 100 + 1600
     assert pump.delivered({**totals, "InsulinTotal": 500 + 1800}, 2, BASAL) == 100
     assert pump.delivered({**totals, "InsulinTotal": 500 + 3600}, 3, BASAL, 1700) == 1800  # the total has it already
+
+
+# ---- totals that are not to be believed
+
+
+def totals(insulin: int, pram: int = 0, boots: int = 0) -> dict[str, int]:
+    return {"PumpBootCount": boots, "InsulinTotal": insulin, "PramTotal": pram}
+
+
+LAST_TOTAL = (1 << 24) - 3  # the two codes above it are Error and SNA
+
+
+def test_codes_are_no_totals_and_a_boot_count_of_sna_neither() -> None:
+    pump = Pump()
+    assert pump.delivered(totals(LAST_TOTAL + 1), 0, BASAL) == -1
+    assert pump.delivered(totals(500, boots=15), 0, BASAL) == -1
+    assert not pump.heard
+    assert pump.delivered(totals(LAST_TOTAL), 0, BASAL) == -1  # the first one is a base, nothing to count from
+    assert pump.delivered(totals(500, boots=14), 1, BASAL) == 500  # and this is another life of the pump
+
+
+def test_a_total_that_falls_is_refused_each_time_and_counted() -> None:
+    pump = Pump()
+    pump.delivered(totals(500), 0, 0)
+    for number in (1, 2, 3):
+        assert pump.delivered(totals(499), number, 0) == 0
+        assert pump.refused == number
+    assert pump.delivered(totals(500), 4, 0) == 0  # equal is not less
+    assert pump.delivered(totals(507), 5, 0) == 7
+    assert pump.refused == 3
+
+
+def test_what_was_assumed_adds_up_until_a_total_comes() -> None:
+    pump = Pump()
+    pump.delivered(totals(500), 0, BASAL)
+    assumed = [pump.delivered(None, step, BASAL) for step in (1, 2, 3)]
+    assert assumed == [119, 119, 119]
+    assert pump.delivered(totals(500 + 400), 4, BASAL) == 400 - 3 * 119
+    assumed = [pump.delivered(None, step, BASAL) for step in (5, 6)]
+    assert pump.delivered(totals(900 + 100), 7, BASAL) == 0
+    assert pump.delivered(totals(1000 + 300), 8, BASAL) == 300 - (sum(assumed) - 100)  # the rest comes off
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "delivered"),
+    [
+        (totals(0, 0), totals(0, 40), 40),
+        (totals(0, 100), totals(0, 100), 0),
+        (totals(0, 100), totals(0, 99), 0),
+        (totals(0, 100), totals(0, 99, boots=1), 99),
+        (totals(0, 100), totals(0, 130, boots=1), 130),
+        (totals(0, 100), totals(0, LAST_TOTAL + 1), 0),
+        (totals(0, 100), totals(0, LAST_TOTAL), LAST_TOTAL - 100),
+        (totals(0, 100), totals(0, 200, boots=15), 0),
+        (totals(0, 100), None, 0),
+    ],
+)
+def test_pramlintide_delivered(before: dict[str, int], now: dict[str, int] | None, delivered: int) -> None:
+    pump = Pump()
+    assert pump.pramlintide(before) == 0
+    pump.delivered(before, 0, BASAL)
+    assert pump.pramlintide(now) == delivered
+
+
+def test_the_first_total_of_pramlintide_is_a_base() -> None:
+    pump = Pump()
+    assert pump.pramlintide(None) == 0
+    assert pump.pramlintide(totals(0, 900)) == 0
+    assert pump.pramlintide(totals(0, 900)) == 900  # the boot count is known from insulin's total only: not told yet
+    pump.delivered(totals(0, 900), 0, BASAL)
+    assert pump.pramlintide(totals(0, 910)) == 10
+
+
+# ---- answers
+
+
+def answer(pump: Pump, purpose: int, echo: int, result: int = 0) -> None:
+    about = {"AckFor": purpose, "AckId": pump._sequence, "AckLimitRaw": 8000}
+    pump.hear_ack({**about, "AckResult": result, "AckEchoRaw": echo})
+
+
+def test_a_set_point_taken_for_another_is_counted_each_time() -> None:
+    pump = Pump()
+    for number in (1, 2, 3):
+        command(pump, Op.SET_RATE, 240, 120)
+        answer(pump, 1, 240)
+        answer(pump, 8, 120)
+        assert pump.misunderstood == 2 * (number - 1)
+        answer(pump, 1, 241)
+        answer(pump, 8, 240)
+        assert pump.misunderstood == 2 * number
+        answer(pump, 1, 0, result=2)  # what it has refused it has not taken for anything
+        assert pump.misunderstood == 2 * number
+
+
+def test_every_set_point_without_an_answer_is_counted() -> None:
+    pump = Pump()
+    command(pump, Op.SET_RATE, 240, 120)
+    command(pump, Op.SET_RATE, 240, 120)
+    assert pump.unanswered == 0  # a pump that never answers is one without acknowledgements
+    answer(pump, 1, 240)
+    for number in (1, 3, 5):
+        command(pump, Op.SET_RATE, 240, 120)
+        assert pump.unanswered == number  # of the one before pramlintide's, then both
+
+
+def test_what_was_asked_for() -> None:
+    pump = Pump()
+    assert pump.asked(BASAL) == (BASAL, 0)
+    command(pump, Op.SET_RATE, 240, 120)
+    assert pump.asked(BASAL) == (1200, 1200)
+
+
+def test_the_age_is_that_of_what_is_missed_longest() -> None:
+    pump = Pump()
+    pump.delivered(totals(0), 10, BASAL)
+    pump.status({"PumpLastBasalSeq": 255, "PumpState": 3, "InsulinOcclusion": 0, "InsulinReservoir": 9,
+                 "PramOcclusion": 0, "PramReservoir": 9}, 10)  # fmt: skip
+    assert pump.age(12) == 2
+    pump.bolus_state(1, 7)
+    assert pump.age(12) == 5
