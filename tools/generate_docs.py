@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pumpbench import catalogue
+from pumpbench.conformance.registry import checks
+from pumpbench.conformance.requirements import Requirement, requirements
+from pumpbench.conformance.requirements import catalogue as catalogue_of_requirements
 from pumpbench.faults import KINDS, dump
 
 import dbc
@@ -415,10 +418,45 @@ def as_flow(fault: Any) -> str:
     return dump([fault]).splitlines()[1].removeprefix("  - ")
 
 
+# ---- docs/conformance.md
+
+
+def conformance() -> str:
+    """The requirements, by group, with how each is checked."""
+    groups: dict[str, list[Requirement]] = {}
+    for each in requirements().values():
+        groups.setdefault(each.group, []).append(each)
+    tables = [
+        f"### {group}\n\n"
+        + table(
+            ("", "requirement", "controls", "source", "check"),
+            [(each.id, each.text, " ".join(each.hazards), each.source, _how(each)) for each in rows],
+        )
+        for group, rows in groups.items()
+    ]
+    sources = table(("", "source"), catalogue_of_requirements().sources.items())
+    return page(
+        "tools/pumpbench/conformance/requirements.yaml, the checks' docstrings and docs/_conformance_intro.md",
+        fill("_conformance_intro.md", {"requirements": "\n\n".join(tables), "sources": sources}),
+    )
+
+
+def _how(requirement: Requirement) -> str:
+    found = checks().get(requirement.id)
+    bound = "*pump*: " if requirement.binds == "pump" else ""
+    if found is not None:
+        needs = f" Needs {', '.join(found.needs)}." if found.needs else ""
+        return f"{bound}{found.how}{needs}"
+    if requirement.evidence is not None:
+        return f"{bound}tested elsewhere: {requirement.evidence}"
+    return f"{bound}not checked: {requirement.open or 'no check is written yet'}"
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "docs/protocol.md": protocol,
     "docs/numbers.md": numbers,
     "docs/faults.md": faults,
+    "docs/conformance.md": conformance,
 }
 """Path within the repository -> what writes it."""
 
