@@ -24,6 +24,8 @@ from can_bus.frame import Frame
 STEP_SECONDS = 300
 STEPS_PER_DAY = 86400 // STEP_SECONDS
 EXEC_TIME_SNA = 65535
+EXEC_TIME_MAX = 65533
+"""Of SYNC_Done, raw; 65534 is a code without a name."""
 
 TURNS_PER_STEP = 32
 """Further turns a device may ask for in one instant before the plant calls it stuck."""
@@ -88,7 +90,7 @@ class Turn:
             "SYNC_Done",
             DoneStatus=status,
             DoneStepIndex=step,
-            ExecTime=EXEC_TIME_SNA if work is None else min(work, EXEC_TIME_SNA - 1),
+            ExecTime=EXEC_TIME_SNA if work is None else min(work, EXEC_TIME_MAX),
             TxCount=min(len(frames) + 1, 254),
         )
         return [*frames, done]

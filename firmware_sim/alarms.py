@@ -63,6 +63,7 @@ STEPS_AT_LEAST = 6
 """Steps an alarm lasts however soon its cause ends, so that a flapping cause raises one alarm in 30 min (FAL-03)."""
 
 STEPS_CONFIRMED = 6
+STEPS_CONFIRMED_OF = {Code.STATE_CHANGE: 3}
 """Steps after which an alarm that was confirmed or snoozed is pending again if its cause still holds (ALM-04)."""
 
 INSTANCES = 65535
@@ -107,7 +108,7 @@ class Alarms:
         elif cause and alarm is not None:
             alarm.aux = aux & 0xFFFF
             alarm.quiet = alarm.quiet + 1 if alarm.state in (State.CONFIRMED, State.SNOOZED) else 0
-            if alarm.quiet > STEPS_CONFIRMED:
+            if alarm.quiet > STEPS_CONFIRMED_OF.get(code, STEPS_CONFIRMED):
                 alarm.state = State.PENDING
                 alarm.quiet = 0
         elif alarm is not None and alarm.steps >= STEPS_AT_LEAST and alarm.state != State.INACTIVE:

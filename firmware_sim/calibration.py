@@ -55,12 +55,10 @@ CORE = {
 }
 """Which CFG_Param signal feeds which word of the control core's parameters."""
 
+NEEDED = tuple(range(10))
+"""CfgIndex of the parameters without which no set becomes active, whatever the mode (requirement STA-01)."""
+
 UNSET = {
-    "CfgMaxBasal": 0,
-    "CfgMaxBolus": 0,
-    "CfgMaxIob": 0,
-    "CfgPramRatio": 0,
-    "CfgPramBolus": 0,
     "CfgInsulinTdd": 0,
     "CfgPramTdd": 0,
     "CfgBasalFactor": 0,
@@ -174,6 +172,8 @@ class Calibration:
         }
 
     def _activate(self) -> None:
+        if not self._received.keys() >= set(NEEDED):
+            return
         values = {self._names[index]: raw for index, raw in self._received.items()}
         parameters = []
         for word in layout.PARAMETERS:

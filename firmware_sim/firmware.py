@@ -27,7 +27,7 @@ from .control.fixed import Ints, round_divide
 from .control.layout import MODE_OFF, MODE_S4
 from .day import Day
 from .isotp import IsoTp
-from .ladder import AGE_DEGRADED, Ladder, State
+from .ladder import AGE_DEGRADED, PUMP_SILENT, Ladder, State
 from .meals import Meals
 from .nvm import Memory, Nvm
 from .pump import Op, Pump
@@ -55,6 +55,9 @@ NVM_WORDS = 320
 
 COMMANDING = (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN)
 """States in which the control law commands rates; in the others its limits cut nothing."""
+
+CHANGES_OF_THEIR_OWN = frozenset({State.INIT, State.SUSPENDED})
+"""States that no other alarm explains: StateChange tells that they are entered or left (requirement FAL-06)."""
 
 ALARM_HOLD = 3
 """Quiet steps after which the alarm of a passing error ends (project's choice)."""
@@ -604,7 +607,7 @@ class Firmware:
             self._refused_seen = self._boluses.refused
             self._last_rejected = step
             self._rejected = False
-        if (state == State.SUSPENDED) != (self._reported_state == State.SUSPENDED):
+        if state != self._reported_state and not CHANGES_OF_THEIR_OWN.isdisjoint((state, self._reported_state)):
             self._last_change = step
         down = self._ladder.rung != State.AUTO
         lost = age >= AGE_DEGRADED or (down and (alarms.active(Code.CGM_LOST) or state == self._ladder.rung))
@@ -615,7 +618,7 @@ class Firmware:
         alarms.hold(Code.E2E_FAULT, step - self._last_e2e_error < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_REJECTED, step - self._last_rejected < ALARM_HOLD, step)
-        alarms.hold(Code.PUMP_LOST, state == State.DELIVERY_UNCERTAIN and not self._boluses.uncertain, step)
+        alarms.hold(Code.PUMP_LOST, self._calibration.active and self._pump.age(step) >= PUMP_SILENT, step)
         amiss = self._boluses.uncertain or self._pump.unlike or self._unbalanced()
         alarms.hold(Code.DELIVERY_UNCERTAIN, amiss, step)
         alarms.hold(Code.URGENT_LOW, self._urgent, step)
@@ -623,14 +626,14 @@ class Firmware:
         alarms.hold(Code.NODE_RESET, step - self._last_reset < ALARM_HOLD, self._boots)
         alarms.hold(Code.WATCHDOG, bool(self._scheduler.late) or self._scheduler.bitten, self._scheduler.overruns)
         alarms.hold(Code.SELF_TEST, self._failures != Failure.NONE, self._failures)
-        alarms.hold(Code.STATE_CHANGE, step - self._last_change < ALARM_HOLD, state)
+        # Suspended stays a cause: the user is reminded of it
+        alarms.hold(Code.STATE_CHANGE, step - self._last_change < ALARM_HOLD or state == State.SUSPENDED, state)
         if state != self._reported_state:
             # every change of state is told with its cause in the same step, also to a user who has confirmed it
             self.log("info", step * STEP_SECONDS, "ladder", f"{self._reported_state.name} -> {state.name}")
             self._reported_state = state
-            alarms.repeat(Code.CGM_LOST)
-            alarms.repeat(Code.PUMP_LOST)
-            alarms.repeat(Code.DELIVERY_UNCERTAIN)
+            for code in (Code.CGM_LOST, Code.PUMP_LOST, Code.DELIVERY_UNCERTAIN, Code.WATCHDOG, Code.SELF_TEST):
+                alarms.repeat(code)
             if self._last_change == step:
                 alarms.renew(Code.STATE_CHANGE)
         alarms.report(self._turn)

@@ -19,7 +19,7 @@ from can_bus import codec, hub_wire
 from can_bus.codec import Transmitter, message, protect
 from can_bus.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, Frame, pack, unpack
 from can_bus.lockstep import Phase
-from firmware_sim.calibration import LOWEST, SET_CRC_INDEX, UNSET, set_crc
+from firmware_sim.calibration import LOWEST, NEEDED, SET_CRC_INDEX, UNSET, set_crc
 from firmware_sim.firmware import Firmware, own_messages, subscriptions
 from firmware_sim.ladder import State
 
@@ -258,7 +258,7 @@ def any_calibration(generator: random.Random) -> dict[int, int]:
         field = message("CFG_Param").pages[index][0]
         low = max(field.low, LOWEST.get(field.name, field.low))
         kind = generator.random()
-        if index == SET_CRC_INDEX or (wild and kind < 0.1 and field.name in UNSET):
+        if index == SET_CRC_INDEX or (wild and kind < 0.1 and field.name in UNSET and index not in NEEDED):
             continue
         if not wild:
             near = round(raw * generator.uniform(0.8, 1.2)) if kind < 0.5 else raw
@@ -288,7 +288,7 @@ def test_any_calibration_gives_the_echoes_and_the_doses_of_the_reference(build: 
 
 
 def test_implausible_parameters_are_refused_and_an_incomplete_set_is_not_active(build: Path) -> None:
-    for change in ({0: 0}, {2: 599}, {10: 9999}, {1: 99}, {1: 20001}, {11: None}, {16: None}):
+    for change in ({0: 0}, {2: 599}, {10: 9999}, {1: 99}, {1: 20001}, {4: None}, {9: None}, {11: None}, {16: None}):
         values = calibration()
         for index, raw in change.items():
             values.pop(index) if raw is None else values.update({index: raw})

@@ -13,6 +13,7 @@ from firmware_sim.alarms import Code
 from firmware_sim.calibration import (
     CORE,
     LOWEST,
+    NEEDED,
     SET_CRC_INDEX,
     UNSET,
     Calibration,
@@ -27,7 +28,7 @@ from plant_server.physiology import load_patient
 NAMES = parameter_names()
 INDEX = {name: index for index, name in NAMES.items()}
 FIELDS = codec.message("CFG_Param").fields
-NEEDED = sorted(INDEX[name] for name in CORE.values() if name not in UNSET)
+MUST = sorted({*NEEDED, *(INDEX[name] for name in CORE.values() if name not in UNSET)})
 
 
 def echoes(bench: Bench, flash: dict[int, int]) -> dict[int, dict[str, int]]:
@@ -81,7 +82,7 @@ def test_the_order_of_flashing_does_not_matter() -> None:
     assert bench.run(3).state == State.AUTO
 
 
-@pytest.mark.parametrize("missing", NEEDED, ids=lambda index: NAMES[index])
+@pytest.mark.parametrize("missing", MUST, ids=lambda index: NAMES[index])
 def test_an_incomplete_set_is_never_active(missing: int) -> None:
     flash = calibration()
     del flash[missing]
@@ -201,7 +202,7 @@ def test_an_index_without_a_parameter_is_answered_and_changes_nothing() -> None:
     assert bench.run(2).rate == rate
 
 
-@pytest.mark.parametrize("name", UNSET)
+@pytest.mark.parametrize("name", [name for name in UNSET if INDEX[name] not in MUST])
 def test_an_unset_limit_counts_as_the_tight_one(name: str) -> None:
     flash = calibration()
     del flash[INDEX[name]]
@@ -209,19 +210,13 @@ def test_an_unset_limit_counts_as_the_tight_one(name: str) -> None:
     bench = Bench(flash=flash, mode=S2)
     turn = bench.run(4, 2000)
     assert turn.state == State.AUTO
-    limits = {
-        "CfgMaxBasal": layout.LIMITER_MAX_BASAL,
-        "CfgBasalFactor": layout.LIMITER_MAX_BASAL,
-        "CfgMaxIob": layout.LIMITER_MAX_IOB,
-        "CfgInsulinTdd": layout.LIMITER_DAY,
-    }
-    if name in limits:
+    if name == "CfgBasalFactor":
         assert turn.rate <= bench.basal // 5
-        assert turn.status["LimiterBits"] & limits[name]
+        assert turn.status["LimiterBits"] & layout.LIMITER_MAX_BASAL
         assert turn.alarms(Code.DOSE_LIMITED)
     else:
         assert turn.rate > bench.basal // 5
-    if name in ("CfgPramRatio", "CfgPramTdd"):
+    if name == "CfgPramTdd":
         assert turn.command["PramlintideRate"] == 0
 
 

@@ -37,7 +37,7 @@ def say(console: Console, *lines: str) -> list[str]:
 @pytest.fixture
 def bench() -> Bench:
     bench = Bench(mode=S2)
-    bench.run(6)
+    bench.run(9)  # by then nothing is told of the start any more
     return bench
 
 
@@ -45,7 +45,7 @@ def test_status_tells_the_newest_step(bench: Bench) -> None:
     (line, ok) = say(Console(bench.firmware), "status")  # type: ignore[arg-type]
     values = dict(pair.split("=") for pair in line.split())
     assert ok == "OK"
-    assert (values["step"], values["time"], values["state"], values["rate"]) == ("5", "1500", "auto", "285")
+    assert (values["step"], values["time"], values["state"], values["rate"]) == ("8", "2400", "auto", "285")
 
 
 def test_parameters_can_be_read_and_not_written(bench: Bench) -> None:
@@ -152,8 +152,8 @@ def test_the_view_shows_whole_steps_and_logs_what_becomes_of_an_alarm(bench: Ben
         assert view.status() is before
         view.publish()
     assert [dict(held[0]), dict(held[1]), list(held[2])] == kept
-    assert view.status()["step"] == 9
-    assert ("warn", 2700, "alarm", "cgm_lost pending") in lines
+    assert view.status()["step"] == 12
+    assert ("warn", 3600, "alarm", "cgm_lost pending") in lines
     for _ in range(12):
         bench.step(1200)
         view.publish()

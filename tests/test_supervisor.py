@@ -411,10 +411,35 @@ def test_a_change_by_the_user_is_info_with_the_state_it_led_to() -> None:
         assert (alarm["CtrlAlarmPriority"], alarm["CtrlAlarmState"], alarm["CtrlAlarmAux"]) == (0, 1, state)
         assert turn.state == state
         instances.append(alarm["CtrlAlarmInstance"])
-        ended = [bench.step().alarms(Code.STATE_CHANGE) for _ in range(STEPS_AT_LEAST + 1)]
-        assert ended[-2][0]["CtrlAlarmState"] == 0 or not ended[-1]
-        bench.run(3)
-    assert len(set(instances)) == 3
+        later = [bench.step().alarms(Code.STATE_CHANGE) for _ in range(STEPS_AT_LEAST + 4)]
+        assert bool(later[-1]) == (state == State.SUSPENDED)  # it is told as long as it lasts
+    assert len(set(instances)) == 2  # resuming is a change of the alarm that tells of suspending
+
+
+def test_the_user_is_reminded_of_suspended() -> None:
+    bench = Bench()
+    bench.run(10)
+    bench.send("MODE_Cmd", ModeRequest=NMA, ModeCmdSeq=1, SuspendRequest=1)
+    (alarm,) = bench.step().alarms(Code.STATE_CHANGE)
+    bench.send("UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"])
+    told = [[alarm["CtrlAlarmState"] for alarm in bench.step().alarms(Code.STATE_CHANGE)] for _ in range(5)]
+    assert told == [[2], [], [], [1], [1]]
+
+
+def test_a_start_is_told_when_it_is_over() -> None:
+    bench = Bench()
+    assert not bench.step().alarms(Code.STATE_CHANGE)
+    (alarm,) = bench.step().alarms(Code.STATE_CHANGE)
+    assert (alarm["CtrlAlarmPriority"], alarm["CtrlAlarmAux"]) == (0, State.AUTO)
+
+
+def test_a_pump_that_falls_silent_while_the_user_has_suspended_is_lost_too() -> None:
+    bench = Bench()
+    bench.run(10)
+    bench.send("MODE_Cmd", ModeRequest=NMA, ModeCmdSeq=1, SuspendRequest=1)
+    turns = [bench.step(status=False) for _ in range(3)]
+    assert [turn.state for turn in turns] == [State.SUSPENDED] * 3
+    assert [bool(turn.alarms(Code.PUMP_LOST)) for turn in turns] == [False, False, True]
 
 
 def test_ladder_changes_alone_are_not_the_users() -> None:

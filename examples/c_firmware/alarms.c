@@ -6,6 +6,7 @@
 
 #define STEPS_AT_LEAST 6u  /* a flapping cause raises one alarm in 30 min (requirement FAL-03) */
 #define STEPS_CONFIRMED 6u /* then it is pending again if its cause still holds (requirement ALM-04) */
+#define STEPS_SUSPENDED 3u /* the same of StateChange, which reminds of Suspended */
 #define INSTANCES 65535u   /* they run from 0 to 65534; 65535 is SNA */
 
 static const struct {
@@ -38,7 +39,7 @@ void alarms_hold(struct alarms *alarms, enum alarm_kind kind, bool cause, int32_
     } else if (cause) {
         alarm->aux = low_bits;
         alarm->quiet = (uint8_t)(alarm->state == STATE(PENDING) ? 0u : alarm->quiet + 1u);
-        if (alarm->quiet > STEPS_CONFIRMED) {
+        if (alarm->quiet > (kind == ALARM_STATE_CHANGE ? STEPS_SUSPENDED : STEPS_CONFIRMED)) {
             alarm->state = STATE(PENDING);
             alarm->quiet = 0u;
         }

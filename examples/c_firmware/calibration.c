@@ -4,6 +4,7 @@
 
 #define REQUIRED INT32_MIN /* without it no set becomes active */
 #define ANY INT32_MIN      /* whatever the range of the DBC allows */
+#define NEEDED 10u         /* nor without any index below, whatever the mode (requirement STA-01) */
 
 /* CfgIndex and signal, the least raw value that is plausible (project's choice), and what counts if it was not flashed:
  * of limits and options the tight value, never unlimited (requirement LIM-04). This firmware gives no boluses and no
@@ -12,11 +13,11 @@
     P(CFG_BASAL, cfg_basal, 1, REQUIRED)                \
     P(CFG_CARB_RATIO, cfg_carb_ratio, 100, REQUIRED)    \
     P(CFG_GLUCOSE_TARGET, cfg_glucose_target, 600, REQUIRED) \
-    P(CFG_MAX_BASAL, cfg_max_basal, ANY, 0)             \
-    P(CFG_MAX_BOLUS, cfg_max_bolus, ANY, 0)             \
-    P(CFG_MAX_IOB, cfg_max_iob, ANY, 0)                 \
-    P(CFG_PRAM_RATIO, cfg_pram_ratio, ANY, 0)           \
-    P(CFG_PRAM_BOLUS, cfg_pram_bolus, ANY, 0)           \
+    P(CFG_MAX_BASAL, cfg_max_basal, ANY, REQUIRED)      \
+    P(CFG_MAX_BOLUS, cfg_max_bolus, ANY, REQUIRED)      \
+    P(CFG_MAX_IOB, cfg_max_iob, ANY, REQUIRED)          \
+    P(CFG_PRAM_RATIO, cfg_pram_ratio, ANY, REQUIRED)    \
+    P(CFG_PRAM_BOLUS, cfg_pram_bolus, ANY, REQUIRED)    \
     P(CFG_INSULIN_TDD, cfg_insulin_tdd, ANY, 0)         \
     P(CFG_STALE_CGM_LIMIT, cfg_stale_cgm_limit, ANY, 15) \
     P(CFG_MEAL_GAIN, cfg_meal_gain, 10000, REQUIRED)    \
@@ -98,7 +99,7 @@ static int32_t value_of(const struct value_set *set, unsigned index)
 static bool is_complete(const struct value_set *set)
 {
     for (unsigned index = 0u; index < CFG_INDICES; index++) {
-        if (unset(index) == REQUIRED && !is_known(set, index)) {
+        if ((index < NEEDED || unset(index) == REQUIRED) && !is_known(set, index)) {
             return false;
         }
     }

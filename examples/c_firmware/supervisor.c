@@ -589,6 +589,12 @@ static void command(struct supervisor *supervisor, int32_t step, const struct ca
     }
 }
 
+/* Whether no other alarm explains that this state is entered or left: StateChange does (requirement FAL-06). */
+static bool is_told_by_itself(enum ladder_state state)
+{
+    return state == LADDER_INIT || state == LADDER_SUSPENDED;
+}
+
 static void report_alarms(struct supervisor *supervisor, int32_t step, const struct calibration *calibration,
                           const struct link_counts *counts, struct report *report)
 {
@@ -607,7 +613,7 @@ static void report_alarms(struct supervisor *supervisor, int32_t step, const str
         supervisor->last_rejected = step;
         supervisor->rejected = false;
     }
-    if ((state == LADDER_SUSPENDED) != (supervisor->reported == LADDER_SUSPENDED)) {
+    if (state != supervisor->reported && (is_told_by_itself(state) || is_told_by_itself(supervisor->reported))) {
         supervisor->last_change = step;
     }
     const bool down = supervisor->rung != LADDER_AUTO;
@@ -619,8 +625,9 @@ static void report_alarms(struct supervisor *supervisor, int32_t step, const str
     alarms_hold(alarms, ALARM_E2E_FAULT, step - supervisor->last_e2e_error < ALARM_HOLD, step);
     alarms_hold(alarms, ALARM_DOSE_LIMITED, step - supervisor->last_limited < ALARM_HOLD, step);
     alarms_hold(alarms, ALARM_DOSE_REJECTED, step - supervisor->last_rejected < ALARM_HOLD, step);
-    alarms_hold(alarms, ALARM_PUMP_LOST, state == LADDER_DELIVERY_UNCERTAIN, step);
     const struct pump *pump = &supervisor->pump;
+    const bool silent = calibration_active(calibration) && silence_of_pump(pump, step) >= PUMP_SILENT;
+    alarms_hold(alarms, ALARM_PUMP_LOST, silent, step);
     const bool amiss = pump->unlike >= UNLIKE_STEPS || is_off(pump->insulin_balance) || is_off(pump->pram_balance);
     alarms_hold(alarms, ALARM_DELIVERY_UNCERTAIN, amiss, step);
     alarms_hold(alarms, ALARM_URGENT_LOW, supervisor->urgent, step);
@@ -628,13 +635,17 @@ static void report_alarms(struct supervisor *supervisor, int32_t step, const str
     const bool bitten = supervisor->overruns_in_a_row >= BITES_AFTER;
     alarms_hold(alarms, ALARM_WATCHDOG, supervisor->late || bitten, (int32_t)(supervisor->overruns & 0xFFFFu));
     alarms_hold(alarms, ALARM_SELF_TEST, supervisor->parameters_damaged, 8); /* Failure.PARAMETERS of the reference */
-    alarms_hold(alarms, ALARM_STATE_CHANGE, step - supervisor->last_change < ALARM_HOLD, state);
+    /* Suspended stays a cause: the user is reminded of it */
+    const bool changed = step - supervisor->last_change < ALARM_HOLD;
+    alarms_hold(alarms, ALARM_STATE_CHANGE, changed || state == LADDER_SUSPENDED, state);
     if (state != supervisor->reported) {
         /* every change of state is told with its cause in the same step, also to a user who has confirmed it */
         supervisor->reported = state;
         alarms_repeat(alarms, ALARM_CGM_LOST);
         alarms_repeat(alarms, ALARM_PUMP_LOST);
         alarms_repeat(alarms, ALARM_DELIVERY_UNCERTAIN);
+        alarms_repeat(alarms, ALARM_WATCHDOG);
+        alarms_repeat(alarms, ALARM_SELF_TEST);
         if (supervisor->last_change == step) {
             alarms_renew(alarms, ALARM_STATE_CHANGE);
         }
