@@ -92,4 +92,4 @@ def expect_failed(requirement: str, text: str, device: Device | None = None) -> 
     """A device that is wrong fails, and the report says what was expected."""
     result = check_one(requirement, device)
     assert result.verdict == Verdict.FAILED, f"{result.verdict.value}: the check cannot see what is wrong"
-    assert text in result.text
+    assert text in result.text, result.text

@@ -19,6 +19,10 @@ Need = Literal["nma", "sma", "ma", "s1", "s2", "s3", "s4", "boluses", "pramlinti
 that its memory can be erased or torn from outside, UDS."""
 
 
+class NotOffered(Exception):
+    """The device turns out, within a check, not to have what it takes; the text says what. No failure."""
+
+
 class Dut:
     """The device under test as a check sees it.
 

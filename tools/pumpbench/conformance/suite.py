@@ -12,7 +12,7 @@ from plant_server.server import PlantError
 from pumpbench.calibration import MODES
 from pumpbench.conformance.device import Device
 from pumpbench.conformance.driver import Bench, Silent, Violation
-from pumpbench.conformance.registry import Check, Dut, Need, checks
+from pumpbench.conformance.registry import Check, Dut, Need, NotOffered, checks
 from pumpbench.conformance.requirements import Requirement, requirements
 from pumpbench.conformance.settings import Settings
 
@@ -212,6 +212,8 @@ def judge(dut: Dut, requirement: Requirement, found: Check) -> Result:
     began = time.monotonic()
     try:
         found.run(dut)
+    except NotOffered as missing_here:
+        return Result(requirement, Verdict.NOT_APPLICABLE, f"needs {missing_here}", time.monotonic() - began)
     except (Violation, PlantError) as error:
         took = time.monotonic() - began
         return Result(requirement, Verdict.FAILED, f"expected {error}", took, list(dut.record()))
