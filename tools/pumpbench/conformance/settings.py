@@ -27,6 +27,8 @@ class Sensor(Group):
     gap: int = Field(ge=0)
     settle: int = Field(ge=1)
     noise: int = Field(ge=0, le=125)
+    low_factor: float = Field(ge=1)
+    low_extra: float = Field(ge=0, le=100)
 
 
 class E2e(Group):
@@ -74,6 +76,8 @@ class Alarms(Group):
     """ALM."""
 
     out_within: int = Field(ge=1)
+    high: tuple[str, ...] = Field(min_length=1)
+    medium: tuple[str, ...] = Field(min_length=1)
     urgent_low: int = Field(ge=40)
     again: int = Field(gt=0)
     suspended_again: int = Field(gt=0)
