@@ -17,6 +17,7 @@ from can_bus.lockstep import Node, Phase
 from plant_server import mechanism
 from plant_server.physiology import Patient, load_patient
 from plant_server.scenario import Meal, Scenario, load_scenario
+from plant_server.sensor import SensorSettings
 from plant_server.server import PlantServer, Run
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
 from pumpbench.conformance.driver import Silent, alarm_code
@@ -57,7 +58,7 @@ class Loop:
         steps: int = 48,
         *,
         tuning: Tuning | None = None,
-        sensor: str = "ideal",
+        sensor: str | SensorSettings = "ideal",
         patient: Patient | None = None,
     ) -> None:
         patient = patient or load_patient("adult#001")

@@ -1,13 +1,22 @@
 """Sensor input (SEN): which samples may be used, and what for."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from can_bus import codec
 from can_bus.frame import Frame
-from plant_server.physiology import load_patient
+from can_bus.lockstep import STEPS_PER_DAY
+from plant_server.physiology import cohort, load_patient
+from plant_server.sensor import SensorSettings
+from plant_server.sensors.coloured import Coloured
+from plant_server.sensors.effects import Bias, Lag
+from plant_server.sensors.ideal import Ideal
+from plant_server.sensors.vettoretti2019 import Vettoretti2019
 from pumpbench.calibration import SAFE, calibrate
 from pumpbench.conformance.driver import GLUCOSE, Bench, State, Turn, calibration, expect
 from pumpbench.conformance.registry import Dut, check
+from pumpbench.hazards import Monitor
 
 HIGH: Final = GLUCOSE + 800
 """A glucose that calls for insulin above the schedule, 0.1 mg/dL."""
@@ -214,3 +223,52 @@ def the_benchs_own_frames(dut: Dut) -> None:
             frames += bench.step(GLUCOSE + 10 * k, also=also if wild else []).frames
         said.append(frames)
     expect(said[0] == said[1], "the same frames whatever PLANT_Truth and FAULT_Inject say")
+
+
+WORST: Final = SensorSettings(model=Coloured(), effects=(Lag(minutes=5.0), Bias(gain=1.1)))
+"""10 % high, 5 min late and with noise of 5 mg/dL: as far off as an iCGM may be with that noise (21 CFR 862.1355)."""
+
+LIMITS: Final = replace(SAFE, stuck_samples=0)
+"""An exact sensor may well say the same for 45 min."""
+
+MEALS: Final = ((7 * 12, 45.0), (13 * 12, 70.0), (19 * 12, 80.0))
+"""Of a day: step and g of carbohydrates."""
+
+
+@check("SEN-10")
+def a_sensor_at_its_worst(dut: Dut) -> None:
+    """A day of an adult with a sensor at its worst, long: a fortnight of ten, and sensors of another make besides.
+
+    No hazard, and hardly more time below 54 mg/dL than with an exact sensor.
+    """
+    sensor = dut.settings.sensor
+    for name in cohort() if dut.long else ["adult#001"]:
+        exact = _share_below_54(dut, name, SensorSettings(model=Ideal()))
+        most = sensor.low_factor * exact + sensor.low_extra
+        for settings in (WORST, SensorSettings(model=Vettoretti2019())) if dut.long else (WORST,):
+            share = _share_below_54(dut, name, settings)
+            expect(
+                share <= most,
+                f"at most {most:.2f} % of the time below 54 mg/dL for {name} with a sensor of the model "
+                f"{settings.model.name}; {share:.2f} % came",
+            )
+
+
+def _share_below_54(dut: Dut, name: str, sensor: SensorSettings) -> float:
+    """Percent of the time; no hazard must be counted."""
+    days = 14 if dut.long else 1
+    meals = [(day * STEPS_PER_DAY + step, carbs) for day in range(days) for step, carbs in MEALS]
+    patient = load_patient(name)
+    loop = dut.loop("nma", meals, days * STEPS_PER_DAY, sensor=sensor, patient=patient, tuning=LIMITS)
+    record, monitor = loop.watch, Monitor()
+
+    def watch(frames: Sequence[Frame]) -> None:
+        record(frames)
+        monitor.watch(frames)
+
+    loop.watch = watch
+    loop.play()
+    found = {hazard: count for hazard, count in monitor.hazards.items() if count}
+    expect(not found, f"no hazard for {name}; {found} were counted, the first in step {monitor.hazards.found[:1]}")
+    glucose = [page["TruthGlucose"] * 0.02 for page in loop.all("PLANT_Truth") if "TruthGlucose" in page]
+    return 100 * sum(value < 54 for value in glucose) / len(glucose)
