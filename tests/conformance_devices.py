@@ -50,6 +50,33 @@ class Changed:
         self._device.renew()
 
 
+class Wired:
+    """The reference behind something that hands on other frames than came, or more of them, or none."""
+
+    def __init__(
+        self,
+        hears: Callable[[Frame], Sequence[Frame]] = lambda frame: [frame],
+        says: Callable[[Frame], Sequence[Frame]] = lambda frame: [frame],
+    ) -> None:
+        self._device = reference()
+        self._hears, self._says = hears, says
+        self.can_restart = True
+        self.finished = False
+
+    def receive(self, frame: Frame) -> Sequence[Frame]:
+        """What the device says to all that it hears."""
+        said = [answer for heard in self._hears(frame) for answer in self._device.receive(heard)]
+        return [other for answer in said for other in self._says(answer)]
+
+    def restart(self, *how: object) -> Sequence[Frame]:
+        """As the reference."""
+        return self._device.restart(*how)  # type: ignore[arg-type]
+
+    def renew(self) -> None:
+        """As the reference."""
+        self._device.renew()
+
+
 def _changed(frame: Frame, change: Change) -> Frame | None:
     message = codec.messages_by_id().get(frame.can_id)
     if message is None or len(frame.data) != message.length:
