@@ -158,6 +158,8 @@ class PlantServer:
     def _on_done(self, values: dict[str, int]) -> list[Frame]:
         expected = self._call if self._phase == Phase.INIT else self.step
         if values["DoneStepIndex"] != expected:
+            if self._phase == Phase.INIT:
+                self._receiver.reset()  # of an earlier call: the device counts from 0 again when it answers the next
             return []
         if self._phase == Phase.INIT:
             self._check_version(values["DoneStatus"])

@@ -57,6 +57,25 @@ def test_late_answers_to_the_roll_call_leave_no_trace() -> None:
     assert loop(0).sha256() == loop(3).sha256()
 
 
+def test_a_device_that_answers_every_call_when_the_last_one_is_out_leaves_no_trace() -> None:
+    made = Loop(3)
+    sent = made.run()
+    info = codec.message("CTRL_Info").can_id
+    position = next(i for i, (_, frame) in enumerate(made.sent) if frame.can_id == info)
+    capture = Capture()
+    for channel, frame in made.sent[:position]:
+        capture.extend(channel, [frame])
+    for call in range(2):  # the loop's own answer is to call 2
+        device = codec.Transmitter()  # which each call starts anew
+        boot_up = device.frame("HB_CTRL", NmtCtrl=0, ToggleCtrl=0, ResetCauseCtrl=0, BootCtrl=1)
+        done = device.frame("SYNC_Done", DoneStatus=0, DoneStepIndex=call, ExecTime=120, TxCount=3)
+        capture.extend(0, [boot_up, made.sent[position][1], done])
+    for channel, frame in made.sent[position:]:
+        capture.extend(channel, [frame])
+    assert len(capture) == len(sent) + 6
+    assert capture.finish().sha256() == sent.finish().sha256()
+
+
 def test_a_roll_call_nobody_answers_is_an_empty_record() -> None:
     tx = codec.Transmitter()
     capture = Capture()

@@ -4,6 +4,7 @@ import pytest
 from pumpbench.calibration import MODES, calibrate
 
 import dbc
+from can_bus import codec
 from can_bus.codec import Receiver, Transmitter
 from can_bus.frame import Frame
 from can_bus.lockstep import TURNS_PER_STEP, Done, Phase, Turn
@@ -68,6 +69,16 @@ def test_a_run_is_roll_call_calibration_steps_and_an_end() -> None:
     assert not device.plant.finished
     assert device.done(2) == []
     assert device.plant.finished
+
+
+def test_a_device_that_is_slow_to_answer_the_roll_call_is_taken_all_the_same() -> None:
+    """Every call is a new life for it, whose first answer has the counter of the one before."""
+    plant, firmware = new_plant(), Firmware()
+    calls = [frame for _ in range(3) for frame in plant.call_roll()]
+    answers = [answer for frame in calls for answer in firmware.receive(frame)]
+    batches = [list(plant.receive(answer)) for answer in answers]
+    assert [bool(batch) for batch in batches] == [False] * (len(answers) - 1) + [True]
+    assert codec.message("CFG_Param").can_id in {frame.can_id for frame in batches[-1]}
 
 
 def test_the_pump_answers_at_the_head_of_the_next_batch() -> None:

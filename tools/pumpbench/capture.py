@@ -211,14 +211,15 @@ def _read_tokens(can_id: Array, good: Array, words: Array) -> list[_Token]:
     ]
 
 
-def _without_roll_call(can_id: Array, good: Array, tokens: list[_Token], done: Array) -> Array:
+def _without_roll_call(can_id: Array, words: Array, tokens: list[_Token], done: Array) -> Array:
     """Mask of the frames after the roll call that starts the run: the last one that calibration or step 0 follows.
 
-    An Init token anywhere else is an injected fault, or a call nobody answered.
+    A device that is slow may answer earlier calls behind it; the run starts with the answer to this one. An Init token
+    anywhere else is an injected fault, or a call nobody answered.
     """
     keep = np.ones(len(can_id), bool)
     phases = _phases()
-    called, opening = -1, len(can_id)
+    called, call, opening = -1, -1, len(can_id)
     for token, following in zip(tokens, [*tokens[1:], None], strict=True):
         if token.phase != phases["Init"]:
             continue
@@ -226,10 +227,11 @@ def _without_roll_call(can_id: Array, good: Array, tokens: list[_Token], done: A
             if called < 0 and all(other.phase == phases["Init"] for other in tokens):
                 keep[:] = False  # nothing but the roll call: there was no run
         elif following.phase == phases["Config"] or (following.phase != phases["Init"] and following.step == 0):
-            called, opening = token.row, following.row
+            called, call, opening = token.row, token.step, following.row
     if called < 0:
         return keep
-    answers = done[(done > called) & (done < opening)]
+    late = done[(done > called) & (done < opening)]
+    answers = late[np.array(_signal("SYNC_Done", "DoneStepIndex", words[late]), "i8") == call]
     keep[: (answers[0] if len(answers) else called) + 1] = False
     # answers to earlier calls that arrive late are no part of the record either
     answer_ids = [codec.message(name).can_id for name in ("SYNC_Done", "CTRL_Info")]
@@ -264,7 +266,7 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
     good = _intact(can_id, length, data)
     tokens = _read_tokens(can_id, good, words)
     done = np.flatnonzero((can_id == codec.message("SYNC_Done").can_id) & good)
-    keep = _without_roll_call(can_id, good, tokens, done)
+    keep = _without_roll_call(can_id, words, tokens, done)
     tokens = [token for token in tokens if keep[token.row] and token.phase != _phases()["Init"]]
     done = done[keep[done]]
     turns = _turns(tokens, done)
