@@ -49,6 +49,8 @@ INJECTED_AT, FLOODED_AT, FLIPPED_FROM = 12, 60, 24
 GIVE_UP = 240.0
 """Seconds of the wall clock after which something is taken to hang."""
 
+pytestmark = pytest.mark.timeout(4 * GIVE_UP)
+
 PATIENCE = f"--connect-timeout {GIVE_UP:g} --step-timeout {GIVE_UP:g}"
 
 HERE = Path(__file__)
