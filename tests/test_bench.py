@@ -26,7 +26,7 @@ def test_what_came_of_it(lost: Outcome) -> None:
     assert lost.hazards == {}
     assert lost.counters["frames_lost"] == 8
     assert [name for _, name in lost.states()] == ["Init", "Auto", "Degraded", "SafeBasal", "Degraded", "Auto"]
-    assert [event.code for event in lost.raised(node="CTRL")] == ["CgmLost"]
+    assert [event.code for event in lost.raised(node="CTRL")] == ["StateChange", "CgmLost"]  # the end of Init is told
     assert lost.raised("CgmLost", "PUMP") == []
     assert len(lost.glucose) == 73
     assert lost.minutes_above(250) == 5 * np.count_nonzero(lost.glucose[:-1] > 250)
@@ -57,7 +57,7 @@ PASS_AND_FAIL = [
      r"CTRL was Degraded at 02:25, not Auto; its states: 00:00 Init, 00:05 Auto, 02:15 Degraded, "),
     (lambda o: o.assert_alarm("CgmLost", after="02:00", within="00:20"),
      lambda o: o.assert_alarm("CgmLost", after="02:00", within="00:10"),
-     r"CTRL did not raise CgmLost within 00:10 after 02:00; it raised: 02:15 CgmLost"),
+     r"CTRL did not raise CgmLost within 00:10 after 02:00; it raised: 00:05 StateChange, 02:15 CgmLost"),
     (lambda o: o.assert_alarm("CgmLost"), lambda o: o.assert_alarm("Occlusion", node="PUMP"),
      r"PUMP did not raise Occlusion after 00:00; it raised: nothing"),
     (lambda o: o.assert_no_alarm("CgmLost", after="03:00"), lambda o: o.assert_no_alarm("CgmLost"),
@@ -100,7 +100,8 @@ def test_hazards_and_an_open_ledger_fail(lost: Outcome) -> None:
 
 def test_the_story_has_faults_alarms_and_states_in_order(lost: Outcome) -> None:
     lines = lost.story().splitlines()
-    assert lines[0] == "02:00  fault Drop CGM_Reading"
+    assert lines[0] == "00:05  CTRL raises StateChange (Info)"
+    assert "02:00  fault Drop CGM_Reading" in lines
     assert "02:15  CTRL raises CgmLost (Medium)" in lines and "02:15  CTRL is Degraded" in lines
     assert lines == sorted(lines, key=lambda line: line[:5])
     assert lost.story(limit=2).splitlines()[-1] == f"... and {len(lines) - 2} more"
