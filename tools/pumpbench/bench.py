@@ -187,12 +187,13 @@ class Outcome:
         return self.trace.alarms
 
     def raised(self, code: str | None = None, node: str | None = None) -> list[AlarmEvent]:
-        """The alarms as they were raised: the first event of every instance."""
-        seen: set[tuple[str, int]] = set()
+        """The alarms as they were raised: the first event of every instance, which a device without memory gives anew."""
+        standing: set[tuple[str, int]] = set()
         found = []
         for event in self.trace.alarms:
-            first = (event.node, event.instance) not in seen
-            seen.add((event.node, event.instance))
+            instance = event.node, event.instance
+            first = instance not in standing
+            (standing.discard if event.state == "Inactive" else standing.add)(instance)
             if first and code in (None, event.code) and node in (None, event.node):
                 found.append(event)
         return found

@@ -60,6 +60,6 @@ def measure(trace: "Trace", frames: "Frames") -> dict[str, Any]:
     }
     safety = monitor.safety(ledger) | {
         "faults_injected": len(trace.faults),
-        "alarms": len({(event.node, event.instance) for event in trace.alarms}),
+        "alarms": len({(event.node, event.instance, event.code) for event in trace.alarms}),
     }
     return outcome | {"safety": safety}
