@@ -13,6 +13,7 @@ from can_bus.frame import CAN_EFF_FLAG, CAN_RTR_FLAG, MAX_DATA, Frame
 from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Node, Phase
 from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES
+from pumpbench.conformance.checks.ladder import SUSPEND
 from pumpbench.conformance.checks.sensor import NOBODY, expect_unused, used
 from pumpbench.conformance.driver import GLUCOSE, NMA, SENT_BY_CTRL, Bench, State, Turn, alarm_code, expect
 from pumpbench.conformance.loop import Values
@@ -28,14 +29,16 @@ CYCLIC: Final = frozenset(each.name for each in HEARD if each.send_type in ("Cyc
 WATCHED: Final = tuple(each.name for each in HEARD if "MsgTimeoutTime" in each.dbc.attributes)
 """What CTRL has to miss when it does not come."""
 
-SUSPEND: Final = codec.choice("MODE_Cmd", "SuspendRequest", "Suspend")
-RESUME: Final = codec.choice("MODE_Cmd", "SuspendRequest", "Resume")
-
 EVENTS_PER_STEP: Final = 16
 """Bad frames in a step, of messages that have no window of checks (E2E-03)."""
 
 
 # ---- what several groups need
+
+
+def carbs_mode(dut: Dut) -> str | None:
+    """A mode with boluses for announced carbohydrates, if the device has one."""
+    return next((name for name in ("ma", "s3") if name in dut.offers), None)
 
 
 def idle_boluses(bench: Bench) -> list[Frame]:
@@ -116,7 +119,8 @@ def _expect_no_effect(dut: Dut, bad: Sequence[tuple[str, Spoil]], what: str) -> 
     cyclic = {name: [spoil for victim, spoil in bad if victim == name] for name in CYCLIC}
     events = iter([each for each in bad if each[0] not in CYCLIC])
     apart = dut.settings.e2e.window + 1  # bad frames beside good ones must not add up to a message that is not valid
-    mode = next((MODES[name] for name in ("ma", "s3") if name in dut.offers), NMA)
+    strategy = carbs_mode(dut)
+    mode = NMA if strategy is None else MODES[strategy]
     calm = dut.bench(mode=mode)
     expected = [_instant(calm, k) for k in range(_steps(bad, apart))]
     spoiled, before = dut.bench(mode=mode), 0
@@ -308,7 +312,7 @@ def masquerade(dut: Dut) -> None:
         bench.run(3)
         turn = bench.step(also=[Frame(codec.message(name).can_id, bytes(codec.message(name).length))])
         expect(bool(turn.alarms("E2EFault")), f"the alarm E2EFault for a {name} that CTRL did not send; none came")
-    strategy = next((name for name in ("ma", "s3") if name in dut.offers), None)
+    strategy = carbs_mode(dut)
     if strategy is not None:
         expect(bool(_boluses_begun(dut, strategy)), "a bolus for a meal of 60 g")
         begun = _boluses_begun(dut, strategy, [Frame(codec.message("PUMP_BolusCmd").can_id, bytes(8))])
