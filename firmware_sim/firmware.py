@@ -330,6 +330,8 @@ class Firmware:
         """End the turn: with a question to the pump as long as a bolus needs its answer, else with the reports."""
         self._turn_open = self._boluses.speak(self._turn)
         if not self._turn_open:
+            if self._boluses.uncertain:
+                self._ladder.doubt()
             self._report_alarms(self._ladder.state, step)
             self._report_status(self._ladder.state)
         self._store()

@@ -88,6 +88,11 @@ class Ladder:
             self.state = self._rung
         return self.state
 
+    def doubt(self) -> None:
+        """A bolus turned out uncertain after `update`, for no answer came to its last try: in force at once."""
+        if self.state in (State.AUTO, State.DEGRADED, State.SAFE_BASAL):
+            self.state = State.DELIVERY_UNCERTAIN
+
     def _next_rung(self, age: int, streak: int, age_degraded: int) -> State:
         if age >= AGE_SAFE_BASAL:
             return State.SAFE_BASAL

@@ -546,3 +546,12 @@ def test_one_sample_and_no_more_is_not_a_start_for_ever() -> None:
     bench = Bench()
     states = [bench.step().state, *(bench.step(drop=True).state for _ in range(8))]
     assert states == [State.INIT] * 7 + [SAFE_BASAL] * 2
+
+
+@pytest.mark.parametrize("state", State)
+def test_doubt_is_in_force_at_once_where_anything_is_dosed(state: State) -> None:
+    ladder = Ladder()
+    ladder.state = state
+    ladder.doubt()
+    doses = state in (State.AUTO, State.DEGRADED, State.SAFE_BASAL)
+    assert ladder.state == (State.DELIVERY_UNCERTAIN if doses else state)
