@@ -214,6 +214,11 @@ class Bench:
             said = self.firmware.receive(frame)
             expect(not said, f"silence out of turn; after {frame_text(frame)} came {_texts(said)}")
 
+    def reboot(self, said: Sequence[Frame]) -> None:
+        """The device was started anew and has said this: its counters begin again."""
+        self.receiver = Receiver(SENT_BY_CTRL)
+        self.listen(said)
+
     def send(self, name: str, **values: int) -> None:
         """Build a frame and give it."""
         self.give(self.frame(name, **values))

@@ -18,6 +18,13 @@ Need = Literal["nma", "sma", "ma", "s1", "s2", "s3", "s4", "boluses", "pramlinti
 """What a check can need of a device: a mode, any mode with boluses or with pramlintide, that it can be started anew,
 that its memory can be erased or torn from outside, UDS."""
 
+MEALTIME: tuple[Need, ...] = ("ma", "s3", "sma", "s4")
+"""Modes that answer a meal with a bolus of insulin, any of which is what "boluses" needs."""
+
+
+class NotOffered(Exception):
+    """The device turns out, within a check, not to have what it takes; the text says what. No failure."""
+
 
 class NotOffered(Exception):
     """The device turns out, within a check, not to have what it takes; the text says what. No failure."""

@@ -12,11 +12,10 @@ from plant_server.server import PlantError
 from pumpbench.calibration import MODES
 from pumpbench.conformance.device import Device
 from pumpbench.conformance.driver import Bench, Silent, Violation
-from pumpbench.conformance.registry import Check, Dut, Need, NotOffered, checks
+from pumpbench.conformance.registry import MEALTIME, Check, Dut, Need, NotOffered, checks
 from pumpbench.conformance.requirements import Requirement, requirements
 from pumpbench.conformance.settings import Settings
 
-BOLUSES: tuple[Need, ...] = ("sma", "ma", "s1", "s2", "s3", "s4")
 PRAMLINTIDE: tuple[Need, ...] = ("s1", "s2", "s3", "s4")
 
 TESTER_PRESENT = bytes.fromhex("023E00").ljust(8, b"\xcc")
@@ -174,7 +173,7 @@ def _offers(device: Device, must: Iterable[str], *, memory: bool) -> frozenset[N
     found: set[Need] = {
         name for name in get_args(Need) if name in MODES and (name in asked or _takes_up(device, MODES[name]))
     }
-    if found.intersection(BOLUSES):
+    if found.intersection(MEALTIME):
         found.add("boluses")
     if found.intersection(PRAMLINTIDE):
         found.add("pramlintide")
