@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import select
 import threading
 import time
@@ -21,6 +22,7 @@ _CHUNK: Final = 4096
 _WRITE_LIMIT: Final = 10.0
 _MAX_LINE: Final = 512
 _CODES: Final = {b"t": 0, b"r": CAN_RTR_FLAG, b"T": CAN_EFF_FLAG, b"R": CAN_EFF_FLAG | CAN_RTR_FLAG}
+_STATUS: Final = re.compile(rb"F([0-9A-Fa-f]{2})")
 _REPLIES: Final = (b"", b"z", b"Z", b"V", b"v", b"N", b"F", b"d", b"D", b"b", b"B")  # the last four are CAN FD frames
 
 
@@ -30,6 +32,10 @@ class SlcanLink(BaseLink):
     python-can sets the adapter up; the frames are then read and written here in bulk, because python-can reads a
     serial port byte by byte. slcan has no error frames (sending one is a ValueError), no flow control beyond the
     serial port's own, and no word about frames that the adapter lost: the counters of the protocol see those.
+
+    Attributes:
+        refusals: commands that the adapter refused (BELL) since something was sent.
+        status: what it said of itself when it was asked last (`ask_status`), None before.
     """
 
     carries_errors = False
@@ -42,6 +48,8 @@ class SlcanLink(BaseLink):
         self._rest = b""
         self._in_step = False
         self._sent = False
+        self.refusals = 0
+        self.status: int | None = None
         self._lock = threading.Lock()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC)  # ends a receive in another thread when this link is closed
         self._poll: select.poll | None = None
@@ -110,7 +118,10 @@ class SlcanLink(BaseLink):
     def _not_a_frame(self, line: bytes) -> None:
         if line.endswith(b"\a"):
             if self._sent:  # before, adapters refuse steps of the set-up that they find needless
+                self.refusals += 1
                 _log.warning("%s: the adapter refused a command; a frame may not have been sent", self._url)
+        elif match := _STATUS.fullmatch(line):
+            self.status = int(match[1], 16)
         elif line[:1] not in _REPLIES and self._in_step:
             _log.warning("%s: ignored what is no slcan: %r", self._url, line)
 
@@ -118,13 +129,21 @@ class SlcanLink(BaseLink):
         """Send the batch in one write. ValueError for error frames: slcan has none."""
         if self._dead is not None:
             raise self._lose("")
-        text = b"".join([_line(frame) for frame in frames])
+        self._write(b"".join([_line(frame) for frame in frames]))
+        self._sent = True
+
+    def _write(self, text: bytes) -> None:
         try:
             with self._lock:
                 self._port.write(text)
         except (OSError, TypeError) as error:
             raise self._lose(f"the serial port is gone ({error})") from error
-        self._sent = True
+
+    def ask_status(self) -> None:
+        """Ask the adapter for its status flags; a later receive finds the answer, which not every adapter gives."""
+        if self._dead is not None:
+            raise self._lose("")
+        self._write(b"F\r")
 
     def fileno(self) -> int:
         """The serial port's descriptor; an OSError for a port that has none."""

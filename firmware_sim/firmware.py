@@ -200,6 +200,7 @@ class Firmware:
         self._clock_caution = 0
         self._urgent = False
         self._peer_version: tuple[int, int] | None = None
+        self._peer_dbc = 0  # CRC-32 of the bench's DBC, 0: not stated
         self._toggle = 0
         self._crc_errors_seen = 0
         self._lost_samples_seen = 0  # of the CGM, by the counter of its frames, when the newest sample came
@@ -280,6 +281,7 @@ class Firmware:
 
     def _on_plant_info(self, values: dict[str, int]) -> None:
         self._peer_version = (values["PlantProtocolMajor"], values["PlantProtocolMinor"])
+        self._peer_dbc = values["PlantDbcCrc"]
 
     def _on_cfg_param(self, values: dict[str, int]) -> None:
         self._turn.send("CFG_ParamEcho", **self._calibration.store(values))
@@ -346,7 +348,7 @@ class Firmware:
             self._last_jump = step
 
     def _answer_roll_call(self, call: int) -> list[Frame]:
-        peer = self._peer_version
+        understood = self._judge_peer()
         self._boot()
         major, minor = dbc.protocol_version()
         self._send_heartbeat(NMT_BOOT_UP)
@@ -358,10 +360,23 @@ class Firmware:
             FirmwareMinor=VERSION[1],
             FirmwareBuild=0,
         )
-        understood = peer is None or peer[0] == major
         answer = self._turn.close(call, Done.OK if understood else Done.FAULT)
         self._boot()  # the run starts with fresh counters, however often the roll was called
         return answer
+
+    def _judge_peer(self) -> bool:
+        """Whether this device speaks the bench's major version; what else differs is logged."""
+        peer, ours = self._peer_version, dbc.protocol_version()
+        if peer is None:
+            return True
+        spoken = f"protocol {peer[0]}.{peer[1]}, this firmware {ours[0]}.{ours[1]}"
+        if peer[0] != ours[0]:
+            self.log("error", 0, "version", f"refused: the bench speaks {spoken}")
+        elif peer != ours:
+            self.log("warn", 0, "version", f"the bench speaks {spoken}")
+        elif self._peer_dbc not in (0, dbc.crc32()):
+            self.log("warn", 0, "version", f"the bench has another DBC: CRC {self._peer_dbc}, ours {dbc.crc32()}")
+        return peer[0] == ours[0]
 
     def _run_step(self, step: int) -> None:
         self._skipped = 0 if self._step is None else step - self._step - 1

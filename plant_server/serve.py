@@ -8,7 +8,7 @@ from can_bus.link import Link
 from .server import PlantServer
 
 ROLL_CALL_EVERY = 0.1
-"""Seconds between two roll calls."""
+"""Seconds between two roll calls; twice as many whenever the device's answer comes too late for the newest one."""
 
 WATCH_EVERY = 0.25
 """Seconds of silence after which the caller's `watch` is asked whether everybody is still alive."""
@@ -43,10 +43,12 @@ def serve(
         BusLost: the bus is gone or lost frames.
     """
     calling = True
+    every = ROLL_CALL_EVERY
+    late = 0
     link.send(plant.call_roll())
     heard = called = time.monotonic()  # others may talk on the bus all the time: only what is answered counts
     while not plant.finished:
-        frames = link.recv(ROLL_CALL_EVERY if calling else WATCH_EVERY)
+        frames = link.recv(min(every, WATCH_EVERY) if calling else WATCH_EVERY)
         answered = False
         for frame in frames:
             answer = list(plant.receive(frame))
@@ -65,7 +67,10 @@ def serve(
         patience = connect_timeout if calling else step_timeout
         if not plant.finished and now > heard + patience:
             raise MemberSilent(_silence(plant, patience))
-        if calling and now >= called + ROLL_CALL_EVERY:
+        if calling and plant.late_answers > late:
+            late = plant.late_answers
+            every *= 2
+        if calling and now >= called + every:
             called = now
             link.send(plant.call_roll())
 

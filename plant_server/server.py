@@ -5,6 +5,7 @@ every sampling instant with what the device must know, gives it the turn, and in
 when the device says it is done. It never waits and never looks at a clock; `plant_server.serve` does.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ from .sensor import Sensor, SensorSettings
 from .sensors.effects import Effect
 from .user import User
 
+_log = logging.getLogger("plant_server.server")
+
 PMOL_PER_L_PER_MU_PER_L = 6.0
 """The model's conversion of plasma insulin: 1 mU/L = 6 pmol/L (Dalla Man et al. 2007)."""
 
@@ -33,6 +36,9 @@ GLUCOSE_UNKNOWN, RATE_UNKNOWN = 8191, -1024
 """CGM_Reading.GlucoseConc and GlucoseRate SNA."""
 
 ALARM_PENDING = 1
+
+VERSION_UNKNOWN = 63
+"""CTRL_Info.CtrlProtocolMajor and CtrlProtocolMinor SNA."""
 
 READING: Layout = (("CGM_Reading", ("CgmState", "GlucoseConc", "GlucoseRate", "CgmSampleSeq", "CgmSampleStep"), {}),)
 HEARTBEATS: Layout = (
@@ -73,13 +79,65 @@ class Run(NamedTuple):
     faults: tuple[AnyPumpFault | Effect, ...] = ()  # of the pump, and of the sensor besides its own effects
 
 
+def stated_version(info: Mapping[str, int]) -> tuple[int, int] | None:
+    """Major and minor version in the raw values of CTRL_Info; None if it does not say."""
+    version = info["CtrlProtocolMajor"], info["CtrlProtocolMinor"]
+    return None if VERSION_UNKNOWN in version else version
+
+
+def judge_version(theirs: tuple[int, int] | None, status: int) -> str | None:
+    """Whether a device that answered the roll call is to be let in: the rules of docs/your-firmware.md.
+
+    Args:
+        theirs: major and minor version of its CTRL_Info; None: it does not say.
+        status: DoneStatus of its answer.
+
+    Returns:
+        What is worth a warning, None if there is nothing.
+
+    Raises:
+        PlantError: it speaks another language, or it refuses.
+    """
+    ours = dbc.protocol_version()
+    if theirs is not None and theirs[0] != ours[0]:
+        raise PlantError(
+            f"CTRL was built for protocol {_dotted(theirs)}, this bench speaks {_dotted(ours)}: "
+            "rebuild the firmware with this bench's pumpbench.dbc"
+        )
+    if status == Done.FAULT:
+        said = "does not say its version" if theirs is None else f"was built for protocol {_dotted(theirs)}"
+        raise PlantError(
+            f"CTRL refused the roll call with DoneStatus Fault; it {said}, this bench speaks {_dotted(ours)}: "
+            "Fault means that the device takes the bench's major version for another one"
+        )
+    if theirs is None or theirs == ours:
+        return None
+    unaware = "the firmware" if theirs < ours else "this bench"
+    return (
+        f"CTRL was built for protocol {_dotted(theirs)}, this bench speaks {_dotted(ours)}: "
+        f"{unaware} does not know what was added in between"
+    )
+
+
+def _dotted(version: tuple[int, int]) -> str:
+    return ".".join(map(str, version))
+
+
 class PlantServer:
-    """The plant's side of the lockstep: see `can_bus.lockstep.Node`."""
+    """The plant's side of the lockstep: see `can_bus.lockstep.Node`.
+
+    Attributes:
+        run: what it was made of.
+        finished: the device has answered the end of the run.
+        step: the sampling instant it is in.
+        late_answers: SYNC_Done to roll calls that were not the newest; a device that is slower than the calls.
+    """
 
     def __init__(self, run: Run) -> None:
         self.run = run
         self.finished = False
         self.step = 0
+        self.late_answers = 0
         self._phase = Phase.INIT
         self._turns = 0
         self._call = 0
@@ -97,7 +155,7 @@ class PlantServer:
         self._user = User(run.scenario, run.mode, run.seed, run.patient.name)
         self._outbox: list[Frame] = []
         self._echoes: dict[int, int] = {}
-        self._info: dict[str, int] | None = None
+        self._version: tuple[int, int] | None = None  # of the protocol the device was built for
         self._mode_seen: int | None = None
 
     @property
@@ -111,6 +169,7 @@ class PlantServer:
     def call_roll(self) -> list[Frame]:
         """The next roll call; to be repeated until `receive` has an answer."""
         self._call += 1
+        self._receiver.reset()  # a device starts its counters anew with every call it answers
         major, minor = dbc.protocol_version()
         return [
             self._roll.frame("PLANT_Info", PlantProtocolMajor=major, PlantProtocolMinor=minor, PlantDbcCrc=dbc.crc32()),
@@ -143,7 +202,7 @@ class PlantServer:
         elif name == "CFG_ParamEcho":
             self._echoes[values["EchoIndex"]] = values["EchoRaw"]
         elif name == "CTRL_Info":
-            self._info = values
+            self._version = stated_version(values)
         return ()
 
     def _hear_heartbeat(self, values: dict[str, int]) -> list[Frame]:
@@ -159,10 +218,13 @@ class PlantServer:
         expected = self._call if self._phase == Phase.INIT else self.step
         if values["DoneStepIndex"] != expected:
             if self._phase == Phase.INIT:
+                self.late_answers += 1
                 self._receiver.reset()  # of an earlier call: the device counts from 0 again when it answers the next
             return []
         if self._phase == Phase.INIT:
-            self._check_version(values["DoneStatus"])
+            warning = judge_version(self._version, values["DoneStatus"])
+            if warning is not None:
+                _log.warning("%s", warning)
             self._receiver.reset()
             return self._configure()
         if self._phase == Phase.CONFIG:
@@ -177,17 +239,6 @@ class PlantServer:
             raise PlantError(f"CTRL did not take up mode {_mode_name(self.run.mode)}: {self._mode_found()}")
         self._advance()
         return self._open_step()
-
-    def _check_version(self, status: int) -> None:
-        ours = dbc.protocol_version()
-        if self._info is None:
-            return  # a firmware that does not say; the calibration will tell
-        theirs = self._info["CtrlProtocolMajor"], self._info["CtrlProtocolMinor"]
-        if theirs[0] != ours[0] or status == Done.FAULT:
-            raise PlantError(
-                f"CTRL was built for protocol {theirs[0]}.{theirs[1]}, this bench speaks {ours[0]}.{ours[1]}: "
-                "rebuild the firmware with this bench's pumpbench.dbc"
-            )
 
     def _configure(self) -> list[Frame]:
         names = codec.message("CFG_Param").pages

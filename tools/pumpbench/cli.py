@@ -11,6 +11,7 @@ import typer
 
 from pumpbench import __version__
 from pumpbench.cli_conformance import conformance
+from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
 from pumpbench.terminal import (
     EXIT_DEAD,
@@ -461,6 +462,7 @@ app.command(name="faults")(faults_command)
 app.command()(matrix)
 app.command()(hunt)
 app.command()(conformance)
+app.command()(doctor)
 
 
 class Interrupted(Exception):

@@ -8,8 +8,8 @@ from rich.console import Console
 
 EXIT_WRONG, EXIT_USAGE, EXIT_DEAD, EXIT_INTERRUPTED = 1, 2, 3, 130
 
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
+console = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120)
+errors = Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
 
 
 class Failed(Exception):
