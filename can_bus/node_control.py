@@ -1,4 +1,4 @@
-"""How a gateway in a process of its own gets the device's power switched: by a command, or by whoever started both.
+"""How a device's power or reset is switched: by a command, by a line of a serial port, or by whoever started it.
 
 Requests are words: `cut`, `start kept`, `start torn`, `start lost`, `freeze`, `thaw` (`can_bus.faults.NodeControl`).
 """
@@ -6,11 +6,19 @@ Requests are words: `cut`, `start kept`, `start torn`, `start lost`, `freeze`, `
 import shlex
 import socket
 import subprocess
-from typing import cast, get_args
+import time
+from typing import Any, cast, get_args
+
+import serial
 
 from can_bus.faults import MemoryState, NodeControl
 
 ANSWER_SECONDS = 60.0
+
+LINES = ("dtr", "rts")
+
+HOLD_SECONDS = 0.1
+"""How long a reset line is held at least; reset inputs with a capacitor take some milliseconds."""
 
 
 class NodeControlError(OSError):
@@ -67,6 +75,62 @@ class CommandControl(_Words):
             raise NodeControlError(
                 f"{shlex.join(command)} ended with status {done.returncode}{': ' + said[-1] if said else ''}"
             )
+
+
+class LineControl:
+    """A modem control line of a serial port that holds the device in reset while it is asserted.
+
+    Development boards wire DTR or RTS of their console so. A line can neither stop a device without a reset nor touch
+    its memory.
+
+    Args:
+        text: `dtr:PORT` or `rts:PORT`, a serial port or a pyserial URL.
+
+    Raises:
+        ValueError: it is neither.
+        NodeControlError: the port cannot be opened.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._line, _, url = text.partition(":")
+        if self._line not in LINES or not url:
+            raise ValueError(f"{text!r}: expected dtr:PORT or rts:PORT, for instance rts:/dev/ttyUSB0")
+        try:
+            self._port: Any = serial.serial_for_url(url, do_not_open=True)
+            self._port.dtr = self._port.rts = False  # opening asserts both otherwise: a reset that nobody asked for
+            self._port.open()
+        except (OSError, ValueError) as error:
+            raise NodeControlError(f"{text}: {error}") from error
+        self._url = url
+
+    def _set(self, asserted: bool) -> None:
+        try:
+            setattr(self._port, self._line, asserted)
+        except OSError as error:
+            raise NodeControlError(f"{self._url} cannot set {self._line.upper()}: {error}") from error
+
+    def cut(self) -> None:
+        """Hold it in reset."""
+        self._set(True)
+
+    def start(self, memory: MemoryState) -> None:
+        """Let it go."""
+        if memory != "kept":
+            raise NodeControlError(f"start {memory}: a reset line cannot touch the device's memory")
+        time.sleep(HOLD_SECONDS)
+        self._set(False)
+
+    def freeze(self) -> None:
+        """It cannot."""
+        raise NodeControlError("freeze: a reset line cannot stop a device without resetting it")
+
+    def thaw(self) -> None:
+        """It cannot either."""
+        raise NodeControlError("thaw: a reset line cannot stop a device without resetting it")
+
+    def close(self) -> None:
+        """Leave the port; both lines are let go."""
+        self._port.close()
 
 
 class SocketControl(_Words):

@@ -183,7 +183,7 @@ def test_nobody_can_cut_the_power_of_a_device_that_runs_by_itself(pumpbench: Pum
     faults = fault_file(runs, [restart(start="01:00")])
     done = pumpbench(*RUN, "--firmware", "none", "--faults", faults, "--out", runs / "x")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "need a firmware that this run starts" in done.stderr
+    assert "need a firmware that this run starts" in done.stderr and "--reset-hook" in done.stderr
 
 
 def test_a_gateway_needs_somebody_who_switches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

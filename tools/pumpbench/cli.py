@@ -37,6 +37,8 @@ SCENARIOS = "validation-14d, tuning, camerlingo, fasting, six-hours, or a YAML o
 SENSORS = "coloured, ideal, breton, facchinetti, dexcom-g5, dexcom-g6, vettoretti, or a YAML file."
 PHYSIOLOGIES = "Equations: S2008, or S2013 with counter-regulation (default: what the patient's file says)."
 PRAMLINTIDE = "Parameter set: P2, P4, moderate, conservative or strong; +type1 behind it for a lower bioavailability."
+RESET_HOOK = "Command that switches a real device, before the run and at its faults: run with cut, start kept, ..."
+RESET_LINE = "The same by a line of a serial port: dtr:PORT or rts:PORT, asserted = in reset."
 VARIABILITY = "What varies in the patient: all, none, or a comma list of k_abs, f, insulin_pk, circadian."
 
 
@@ -87,6 +89,8 @@ def run(
         str | None,
         typer.Option(help="Command that starts another firmware; {bus} becomes its URL; none: it runs by itself."),
     ] = None,
+    reset_hook: Annotated[str | None, typer.Option(help=RESET_HOOK)] = None,
+    reset_line: Annotated[str | None, typer.Option(help=RESET_LINE)] = None,
     sensor: Annotated[str, typer.Option(help=SENSORS)] = "coloured",
     physiology: Annotated[str | None, typer.Option(help=PHYSIOLOGIES)] = None,
     pramlintide: Annotated[str, typer.Option(help=PRAMLINTIDE)] = "P2",
@@ -115,6 +119,8 @@ def run(
             device_bus=device_bus,
             faults=faults,
             firmware=firmware,
+            reset_hook=reset_hook,
+            reset_line=reset_line,
             sensor=sensor,
             physiology=physiology,
             pramlintide=pramlintide,

@@ -29,13 +29,13 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import dbc
-from can_bus.faults import MemoryState, NodeFault
+from can_bus.faults import Hang, MemoryState, NodeControl, NodeFault, Restart
 from can_bus.frame import Frame
 from can_bus.gateway import Gateway, Side
 from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.lockstep import STEPS_PER_DAY, Node
-from can_bus.node_control import attend
+from can_bus.node_control import CommandControl, LineControl, attend
 from can_bus.url import open_link
 from plant_server.physiology import SOURCES, Patient, load_patient
 from plant_server.scenario import load_scenario
@@ -89,6 +89,8 @@ class Request:
     device_bus: str | None = None
     faults: Path | Faults | None = None
     firmware: str | None = None
+    reset_hook: str | None = None  # a command that switches the device, as `pumpbench gateway --node` takes one
+    reset_line: str | None = None  # dtr:PORT or rts:PORT
     sensor: str = "coloured"
     physiology: str | None = None  # None: what the patient's file says
     pramlintide: str = "P2"
@@ -157,8 +159,7 @@ def prepare(request: Request) -> Prepared:
     sensor = load_sensor(request.sensor)
     tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
     calibration = calibrate(patient, tuning, model)
-    if request.firmware == SOMEBODY_ELSES and any(isinstance(fault, NodeFault) for fault in faults.wire):
-        raise RigError("faults of the device need a firmware that this run starts; --firmware is none")
+    _check_switch(request, [fault for fault in faults.wire if isinstance(fault, NodeFault)])
     mode = MODES[request.strategy]
     injected = faults.pump + faults.sensor
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, injected)
@@ -181,6 +182,7 @@ def prepare(request: Request) -> Prepared:
         "sensor": request.sensor,
         "bus": request.bus,
         "firmware": request.firmware or "built-in",
+        **({"reset": request.reset_hook or request.reset_line} if request.reset_hook or request.reset_line else {}),
         "faults": faults.as_json(),
         "parameters": {
             "patient_sha256": _sha256(patient.params.tobytes() + patient.x0.tobytes()),
@@ -190,6 +192,29 @@ def prepare(request: Request) -> Prepared:
         },
     }
     return Prepared(request, run, faults, info)
+
+
+def _check_switch(request: Request, faults: Sequence[NodeFault]) -> None:
+    """Whether there is somebody who can do these faults to the device.
+
+    Raises:
+        RigError: there is not, or there are two.
+    """
+    hook, line = request.reset_hook, request.reset_line
+    if hook is not None and line is not None:
+        raise RigError("give --reset-hook or --reset-line: one of them switches the device")
+    if (hook is not None or line is not None) and request.bus == "inproc":
+        raise RigError("--bus inproc has no device to reset; --reset-hook and --reset-line need a bus")
+    if hook is not None and not shlex.split(hook):
+        raise RigError("--reset-hook is empty; give the command that switches the device")
+    for fault in faults:
+        if line is not None and (isinstance(fault, Hang) or (isinstance(fault, Restart) and fault.memory != "kept")):
+            raise RigError(f"{fault.kind}: --reset-line can only restart a device, its memory kept; use --reset-hook")
+        if request.firmware == SOMEBODY_ELSES and hook is None and line is None:
+            raise RigError(
+                f"{fault.kind}: somebody has to do this to the device: faults of the node need a firmware that this "
+                "run starts (--firmware CMD), or --reset-hook or --reset-line for a device that runs by itself"
+            )
 
 
 def controller_model(asked: str, patient: Patient, file: Path | None) -> ControllerModel:
@@ -530,8 +555,13 @@ def _processes(prepared: Prepared) -> Path:
             return start("firmware", command, ready=False)
 
         firmware = None if request.firmware == SOMEBODY_ELSES else Process(launch, nvm)
-        if ours is not None and firmware is not None:
-            threading.Thread(target=attend, args=(ours, firmware), daemon=True).start()
+        board = _board(request, stack)
+        if board is not None:
+            board.cut()
+            board.start("kept")
+        switched = board or firmware
+        if ours is not None and switched is not None:
+            threading.Thread(target=attend, args=(ours, switched), daemon=True).start()
 
         def watch() -> None:
             for child in list(children):  # a dead gateway is why a firmware ends, not the other way round
@@ -554,6 +584,23 @@ def _processes(prepared: Prepared) -> Path:
             raise
         _await_end(children, recorder, hub)
     return request.out
+
+
+def _board(request: Request, stack: contextlib.ExitStack) -> NodeControl | None:
+    """What switches a device that is no process of ours.
+
+    Raises:
+        RigError: there is no such line.
+        NodeControlError: its port cannot be opened.
+    """
+    if request.reset_hook is not None:
+        return CommandControl(request.reset_hook)
+    if request.reset_line is None:
+        return None
+    try:
+        return stack.enter_context(contextlib.closing(LineControl(request.reset_line)))
+    except ValueError as error:
+        raise RigError(f"--reset-line {error}") from None
 
 
 def _switch(prepared: Prepared, stack: contextlib.ExitStack) -> tuple[socket.socket | None, socket.socket | None]:
