@@ -60,12 +60,13 @@ class Clock:
         time: simulated seconds.
         running: the roll call is over; how often the roll was called depends on the wall clock, so that a fault must
             not act on it.
-        ended: the device has answered the last token.
+        ended: the device has answered the last token, or in a free run the last token was given.
         first_turn: the newest token opened a step.
         step: of the newest token.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, free_running: bool = False) -> None:
+        self._free_running = free_running
         self.time = 0
         self.running = False
         self.ended = False
@@ -86,6 +87,8 @@ class Clock:
         self.running = self._phase != Phase.INIT
         if self._phase == Phase.INIT:
             self.time = 0
+        elif self._phase == Phase.END:
+            self.ended |= self._free_running
         elif self._phase == Phase.STEP:
             self.first_turn = True
             self.time = self.step * STEP_SECONDS
@@ -160,14 +163,17 @@ class Gateway:
     Args:
         faults: what is to go wrong.
         control: who runs the device; needed by faults that take its power or its time away.
+        free_running: the device answers no token.
 
     Raises:
         ValueError: such a fault, and nobody who could do it.
     """
 
-    def __init__(self, faults: Sequence[Fault] = (), control: NodeControl | None = None) -> None:
+    def __init__(
+        self, faults: Sequence[Fault] = (), control: NodeControl | None = None, *, free_running: bool = False
+    ) -> None:
         self._injector = Injector([fault for fault in faults if not isinstance(fault, NodeFault)])
-        self._clock = Clock()
+        self._clock = Clock(free_running=free_running)
         self._tokens, self._dones = Stamp("SYNC_Step"), Stamp("SYNC_Done")
         self._device = _Device([fault for fault in faults if isinstance(fault, NodeFault)], control)
 
@@ -371,13 +377,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--host", action="store_true", help="serve the device's bus as a hub, from this process")
     parser.add_argument("--tap", metavar="URL", help="serve a hub that shows the device's bus, for a recorder")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="YAML file of faults")
+    parser.add_argument("--free-running", action="store_true", help="the device answers no token")
     switch = parser.add_mutually_exclusive_group()
     switch.add_argument("--node", metavar="CMD", help="switches the device: run with cut, start kept, freeze or thaw")
     switch.add_argument("--node-socket", type=int, metavar="FD", help="a stream socket whose other end switches it")
     options = parser.parse_args(arguments)
     try:
         faults = load_faults(options.faults) if options.faults else ()
-        gateway = Gateway(faults, _control(options))
+        gateway = Gateway(faults, _control(options), free_running=options.free_running)
     except ValueError as error:
         print(f"gateway: {error}", file=sys.stderr)
         return 2

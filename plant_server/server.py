@@ -130,6 +130,7 @@ class PlantServer:
         run: what it was made of.
         finished: the device has answered the end of the run.
         step: the sampling instant it is in.
+        heard: something of CTRL came that it may use.
         late_answers: SYNC_Done to roll calls that were not the newest; a device that is slower than the calls.
     """
 
@@ -137,6 +138,7 @@ class PlantServer:
         self.run = run
         self.finished = False
         self.step = 0
+        self.heard = False
         self.late_answers = 0
         self._phase = Phase.INIT
         self._turns = 0
@@ -186,6 +188,7 @@ class PlantServer:
         check, name, values, _ = self._receiver.receive(frame)
         if check > Check.OK_SOME_LOST:
             return ()
+        self.heard = True
         if name == "PUMP_BasalCmd":
             self._outbox += self.pump.command(values, self.step, self._transmitter)
         elif name == "PUMP_BolusCmd":

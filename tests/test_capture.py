@@ -165,14 +165,14 @@ def test_a_replayed_roll_call_ends_no_record() -> None:
     assert frames.step[-1] == 8
 
 
-def test_free_run_belongs_to_the_last_token() -> None:
+def test_in_a_free_run_the_batch_belongs_to_its_token_and_the_device_to_the_last_one() -> None:
     tx = codec.Transmitter()
     capture = Capture()
     for k in range(3):
         capture.extend(0, [tx.frame("HB_CGM", NmtCgm=5, ToggleCgm=0, ResetCauseCgm=0, BootCgm=1)])
         capture.extend(0, [tx.frame("SYNC_Step", SyncPhase=1, StepIndex=k, SimTime=300 * k)])
         capture.extend(0, [tx.frame("HB_CTRL", NmtCtrl=5, ToggleCtrl=0, ResetCauseCtrl=0, BootCtrl=1)])
-    assert capture.finish().step.tolist() == [0, 0, 0, 0, 1, 1, 1, 2, 2]
+    assert capture.finish().step.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
 
 
 def test_a_step_nobody_answers_ends_where_the_plant_speaks_again() -> None:

@@ -5,7 +5,8 @@ themselves (SYNC_Step and SYNC_Done) and gives every frame its step, its turn an
 nothing but what was on the wire: not on the transport, and not on when a frame happened to be read.
 
 A frame that comes after a SYNC_Done belongs to the turn of the next token (the plant's batch precedes its token), one
-between a token and its SYNC_Done to that turn. The roll call before the first turn is repeated by the wall clock and is
+between a token and its SYNC_Done to that turn. Of a device that sends no SYNC_Done (a free run) all frames up to the
+batch of the next token do. The roll call before the first turn is repeated by the wall clock and is
 no part of the record.
 """
 
@@ -191,6 +192,11 @@ def _bench_ids() -> Array:
     return np.array([message.can_id for message in codec.messages().values() if message.sender in names], "u4")
 
 
+@functools.cache
+def _device_ids() -> Array:
+    return np.array([message.can_id for message in codec.messages().values() if message.sender == "CTRL"], "u4")
+
+
 def _signal(message: str, name: str, words: Array) -> list[int]:
     field = codec.message(message).fields[name]
     return [int(word) >> field.shift & field.mask for word in words]
@@ -275,10 +281,14 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
         zeros = np.zeros(count, "i8")
         return keep, zeros, zeros, np.arange(count) * FRAME_MICROSECONDS
 
+    phases = _phases()
     starts = np.array([token.row for token in turns])
     limits = np.append(starts[1:], count)
-    ends = limits - 1  # last row of each turn; without any SYNC_Done (free run) a frame belongs to the last token seen
-    if len(done):
+    ends = limits - 1  # last row of each turn
+    if not np.any(done > next((token.row for token in turns if token.phase == phases["Step"]), count)):
+        for index, (start, limit) in enumerate(zip(starts, limits, strict=True)):
+            ends[index] = _batch_start(can_id, start + 1, limit) - 1
+    else:
         first = np.searchsorted(done, starts)
         for index, (start, limit) in enumerate(zip(starts, limits, strict=True)):
             if first[index] < len(done) and done[first[index]] < limit:
@@ -289,7 +299,6 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
                     ends[index] = start + others[0]
     rows = np.arange(count)
     turn_of = np.searchsorted(ends, rows)  # the first turn that ends at or after the row
-    phases = _phases()
     steps: list[int] = []
     numbers: list[int] = []
     bases: list[int] = []
@@ -314,6 +323,12 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
     micros = np.zeros(count, "i8")
     micros[kept] = _microseconds(base_of[kept])
     return keep, np.array(steps)[turn_of], np.array(numbers)[turn_of], micros
+
+
+def _batch_start(can_id: Array, start: int, limit: int) -> int:
+    """First row of the plant's batch at the end of these rows: what stands behind the last frame of the device."""
+    own = np.flatnonzero(np.isin(can_id[start:limit], _device_ids()))
+    return start + int(own[-1]) + 1 if len(own) else start
 
 
 def _microseconds(base_s: Array) -> Array:

@@ -42,7 +42,8 @@ def measure(trace: "Trace", frames: "Frames") -> dict[str, Any]:
 
     Returns:
         Outcome metrics (percent of samples, U and ug per day) and, under `safety`, counters, ledger and hazards.
-        Without a single full step the outcome metrics are None.
+        Without a single full step the outcome metrics are None. In a free run no hazard is judged (None each): who may
+        say what, and of which sample it knows, follows from the turns, which there are none of.
     """
     glucose = trace.get("TruthGlucose")[:-1]
     glucose = glucose[np.isfinite(glucose)]
@@ -62,4 +63,6 @@ def measure(trace: "Trace", frames: "Frames") -> dict[str, Any]:
         "faults_injected": len(trace.faults),
         "alarms": len({(event.node, event.instance, event.code) for event in trace.alarms}),
     }
+    if trace.info.get("free_running"):
+        safety |= {"hazards": dict.fromkeys(safety["hazards"]), "first_hazards": []}
     return outcome | {"safety": safety}

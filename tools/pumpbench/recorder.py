@@ -34,9 +34,14 @@ class _Stop(Exception):
 
 
 class Ending:
-    """Knows from the frames of one bus when the run is over: SYNC_Done after SYNC_Step(End)."""
+    """Knows from the frames of one bus when the run is over: SYNC_Done after SYNC_Step(End).
 
-    def __init__(self) -> None:
+    Args:
+        free_running: the device does not answer; SYNC_Step(End) is the end.
+    """
+
+    def __init__(self, *, free_running: bool = False) -> None:
+        self._free_running = free_running
         self._step_id = codec.message("SYNC_Step").can_id
         self._done_id = codec.message("SYNC_Done").can_id
         self._ending = False
@@ -47,17 +52,18 @@ class Ending:
         for can_id, data in frames:
             if can_id == self._step_id and len(data) == 8:
                 self._ending = data[1] >> 4 == Phase.END
+                self.over |= self._ending and self._free_running
             elif can_id == self._done_id and self._ending:
                 self.over = True
 
 
-def listen(links: Sequence[Link], capture: Capture) -> bool:
+def listen(links: Sequence[Link], capture: Capture, *, free_running: bool = False) -> bool:
     """Collect frames until the run is over on every bus; False if asked to stop before (SIGTERM, SIGINT).
 
     Raises:
         BusLost: a bus is gone or frames were lost.
     """
-    endings = [Ending() for _ in links]
+    endings = [Ending(free_running=free_running) for _ in links]
     by_descriptor = {link.fileno(): channel for channel, link in enumerate(links)}
     lossless = all(link.url.startswith(("unix:", "tcp:", "inproc:")) for link in links)
     try:
@@ -105,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--plant-bus", metavar="URL", help="the plant's bus, when a gateway lies between")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="the run folder to write")
     parser.add_argument("--info", type=Path, metavar="FILE", help="JSON to be merged into run.json")
+    parser.add_argument("--free-running", action="store_true", help="the device answers no token")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing run folder")
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, _stop)
@@ -120,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _failed(error, 2)
         print("ready", flush=True)
         try:
-            complete = listen(links, capture)
+            complete = listen(links, capture, free_running=options.free_running)
         except (BusLost, can.CanError, OSError) as error:
             write(folder, capture, info, complete=False)
             return _failed(error, 3)

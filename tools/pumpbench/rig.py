@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypedDict
 
 import dbc
 from can_bus.faults import Hang, MemoryState, NodeControl, NodeFault, Restart
@@ -37,6 +37,7 @@ from can_bus.link import Link
 from can_bus.lockstep import STEPS_PER_DAY, Node
 from can_bus.node_control import CommandControl, LineControl, attend
 from can_bus.url import open_link
+from plant_server.free_run import FreePlant, serve_free
 from plant_server.physiology import SOURCES, Patient, load_patient
 from plant_server.scenario import load_scenario
 from plant_server.sensor import load_sensor
@@ -91,6 +92,8 @@ class Request:
     firmware: str | None = None
     reset_hook: str | None = None  # a command that switches the device, as `pumpbench gateway --node` takes one
     reset_line: str | None = None  # dtr:PORT or rts:PORT
+    free_running: bool = False  # the device keeps time by itself
+    speed: float = 1.0  # of the wall clock, in a free run
     sensor: str = "coloured"
     physiology: str | None = None  # None: what the patient's file says
     pramlintide: str = "P2"
@@ -159,6 +162,7 @@ def prepare(request: Request) -> Prepared:
     sensor = load_sensor(request.sensor)
     tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
     calibration = calibrate(patient, tuning, model)
+    _check_speed(request)
     _check_switch(request, [fault for fault in faults.wire if isinstance(fault, NodeFault)])
     mode = MODES[request.strategy]
     injected = faults.pump + faults.sensor
@@ -183,6 +187,7 @@ def prepare(request: Request) -> Prepared:
         "bus": request.bus,
         "firmware": request.firmware or "built-in",
         **({"reset": request.reset_hook or request.reset_line} if request.reset_hook or request.reset_line else {}),
+        **({"free_running": True, "speed": request.speed, "reproducible": False} if request.free_running else {}),
         "faults": faults.as_json(),
         "parameters": {
             "patient_sha256": _sha256(patient.params.tobytes() + patient.x0.tobytes()),
@@ -192,6 +197,20 @@ def prepare(request: Request) -> Prepared:
         },
     }
     return Prepared(request, run, faults, info)
+
+
+def _check_speed(request: Request) -> None:
+    """Whether a free run can be had.
+
+    Raises:
+        RigError: it cannot, or a speed was given without it.
+    """
+    if not request.free_running and request.speed != 1.0:
+        raise RigError("--speed is that of a free run (--free-running); lockstep is as fast as the device")
+    if request.speed <= 0:
+        raise RigError("--speed is simulated seconds in a second, above 0")
+    if request.free_running and request.bus == "inproc":
+        raise RigError("--bus inproc is lockstep; a free run needs a bus")
 
 
 def _check_switch(request: Request, faults: Sequence[NodeFault]) -> None:
@@ -471,6 +490,15 @@ def _children() -> Iterator[list[Child]]:
             child.end()
 
 
+class _Options(TypedDict):
+    """What both ways to serve a plant take."""
+
+    connect_timeout: float
+    step_timeout: float
+    watch: Callable[[], None]
+    progress: Callable[[int], None]
+
+
 class _Buses(NamedTuple):
     """The buses of a run as URLs."""
 
@@ -571,14 +599,16 @@ def _processes(prepared: Prepared) -> Path:
                 firmware.check()
 
         try:
-            serve(
-                PlantServer(prepared.run),
-                link,
+            options = _Options(
                 connect_timeout=request.connect_timeout,
                 step_timeout=request.step_timeout,
                 watch=watch,
                 progress=request.progress,
             )
+            if request.free_running:
+                serve_free(FreePlant(prepared.run), link, speed=request.speed, **options)
+            else:
+                serve(PlantServer(prepared.run), link, **options)
         except Exception:
             watch()  # a dead node is the better explanation
             raise
@@ -622,6 +652,7 @@ def _start_recorder_side(
         command = [sys.executable, "-m", "can_bus.gateway", "--plant", buses.plant, "--device", buses.device]
         command += ["--faults", str(wire)]
         command += ["--host"] if buses.hosted else []
+        command += ["--free-running"] if prepared.request.free_running else []
         command += ["--tap", buses.shown] if buses.shown not in (buses.device, buses.plant) else []
         if switch is None:
             start("gateway", command, ready=True)
@@ -632,6 +663,7 @@ def _start_recorder_side(
     info.write_text(json.dumps(prepared.info), encoding="utf-8")
     command = [sys.executable, "-m", "pumpbench.recorder", "--bus", buses.shown, "--out", str(prepared.request.out)]
     command += ["--info", str(info), "--overwrite"]
+    command += ["--free-running"] if prepared.request.free_running else []
     if buses.shown != buses.plant:
         command += ["--plant-bus", buses.plant]
     return start("recorder", command, ready=True)
