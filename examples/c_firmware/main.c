@@ -5,38 +5,10 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "protocol.h"
+#include "device.h"
 #include "transport.h"
 
-static const struct transport *const TRANSPORTS[] = {&transport_hub, &transport_socketcan};
-
-static struct firmware firmware;
-static struct frame heard[TRANSPORT_BATCH];
-static struct frame answer[FIRMWARE_FRAMES_AT_MOST];
-
-static int run(const struct transport *bus)
-{
-    size_t n = 0u;
-    firmware_start(&firmware, answer, &n);
-    if (!bus->send(answer, n)) {
-        return 3;
-    }
-    for (;;) {
-        const size_t frames = bus->receive(heard);
-        if (frames == 0u) {
-            return 3;
-        }
-        for (size_t i = 0u; i < frames; i++) {
-            const bool goes_on = firmware_receive(&firmware, &heard[i], answer, &n);
-            if (n > 0u && !bus->send(answer, n)) {
-                return 3;
-            }
-            if (!goes_on) {
-                return 0;
-            }
-        }
-    }
-}
+static const struct transport *const TRANSPORTS[] = {&transport_hub, &transport_socketcan, &transport_slcan};
 
 int main(int argc, char **argv)
 {
@@ -48,11 +20,11 @@ int main(int argc, char **argv)
     for (size_t i = 0u; i < sizeof TRANSPORTS / sizeof *TRANSPORTS; i++) {
         const struct transport *bus = TRANSPORTS[i];
         if (bus->knows(url)) {
-            const int status = bus->open(url) ? run(bus) : 3;
+            const int status = bus->open(url) && device_run(bus) ? 0 : 3;
             bus->close();
             return status;
         }
     }
-    fprintf(stderr, "firmware: %s: expected unix:/path, tcp:127.0.0.1:port, socketcan:vcan0 or stdio:\n", url);
+    fprintf(stderr, "firmware: %s: expected unix:/path, tcp:127.0.0.1:port, socketcan:vcan0, stdio: or slcan:\n", url);
     return 2;
 }

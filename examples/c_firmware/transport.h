@@ -9,7 +9,7 @@
 
 #define TRANSPORT_BATCH 64u /* most frames of one call */
 
-/* Errors are one line on stderr. There is one bus per process, so a transport keeps its socket to itself. */
+/* Errors are one line on stderr. There is one bus per program, so a transport keeps its socket to itself. */
 struct transport {
     /* Whether the transport knows this kind of URL. */
     bool (*knows)(const char *url);
@@ -28,5 +28,8 @@ extern const struct transport transport_hub;
 
 /* socketcan:vcan0 */
 extern const struct transport transport_socketcan;
+
+/* slcan: the text of USB-CAN adapters on the serial line of serial.h. Joined when the other end opens the channel. */
+extern const struct transport transport_slcan;
 
 #endif
