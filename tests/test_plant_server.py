@@ -1,5 +1,7 @@
 """The plant as a node: roll call, calibration, turns, and what it refuses."""
 
+from collections.abc import Sequence
+
 import pytest
 from pumpbench.calibration import MODES, calibrate
 
@@ -9,6 +11,7 @@ from can_bus.codec import Receiver, Transmitter
 from can_bus.frame import Frame
 from can_bus.lockstep import TURNS_PER_STEP, Done, Phase, Turn
 from firmware_sim.firmware import Firmware
+from plant_server import serve
 from plant_server.physiology import load_patient
 from plant_server.scenario import load_scenario
 from plant_server.server import PlantError, PlantServer, Run
@@ -79,6 +82,51 @@ def test_a_device_that_is_slow_to_answer_the_roll_call_is_taken_all_the_same() -
     batches = [list(plant.receive(answer)) for answer in answers]
     assert [bool(batch) for batch in batches] == [False] * (len(answers) - 1) + [True]
     assert codec.message("CFG_Param").can_id in {frame.can_id for frame in batches[-1]}
+
+
+def test_answers_to_older_calls_that_a_serial_line_held_back_do_not_spoil_the_newest() -> None:
+    """A device begins its counters anew with every roll call: what it says is no repetition."""
+    device = Device(new_plant())
+    for _ in range(3):
+        device.plant.call_roll()
+    for call in (1, 2):
+        device.transmitter = Transmitter()
+        assert device.done(call) == []
+    device.transmitter = Transmitter()
+    assert [name for name, _ in device.done(3)][-1] == "SYNC_Step"
+
+
+class SlowLine:
+    """A firmware that hears and is heard later, by a clock of its own."""
+
+    url, carries_errors = "slow", True
+
+    def __init__(self, delay: float) -> None:
+        self.delay, self.now = delay, 0.0
+        self.firmware = Firmware()
+        self.coming: list[tuple[float, Frame]] = []
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        said = [answer for frame in frames for answer in self.firmware.receive(frame)]
+        self.coming += [(self.now + self.delay, frame) for frame in said]
+
+    def recv(self, timeout: float) -> list[Frame]:
+        self.now = min([self.now + timeout, *(max(due, self.now) for due, _ in self.coming)])
+        there = [frame for due, frame in self.coming if due <= self.now]
+        self.coming = [(due, frame) for due, frame in self.coming if due > self.now]
+        return there
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.12, 0.5])
+def test_a_device_slower_than_the_roll_is_called_is_heard(delay: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SlowLine(delay)
+    monkeypatch.setattr(serve.time, "monotonic", line.monotonic)
+    plant = new_plant(steps=2)
+    serve.serve(plant, line)
+    assert plant.finished
 
 
 def test_the_pump_answers_at_the_head_of_the_next_batch() -> None:
