@@ -21,6 +21,7 @@ _log = logging.getLogger("can_bus.slcan")
 _CHUNK: Final = 4096
 _WRITE_LIMIT: Final = 10.0
 _MAX_LINE: Final = 512
+_WARNINGS: Final = 20  # of one link: an adapter that babbles must not fill a disk with what is said of it
 _CODES: Final = {b"t": 0, b"r": CAN_RTR_FLAG, b"T": CAN_EFF_FLAG, b"R": CAN_EFF_FLAG | CAN_RTR_FLAG}
 _STATUS: Final = re.compile(rb"F([0-9A-Fa-f]{2})")
 _REPLIES: Final = (b"", b"z", b"Z", b"V", b"v", b"N", b"F", b"d", b"D", b"b", b"B")  # the last four are CAN FD frames
@@ -50,6 +51,7 @@ class SlcanLink(BaseLink):
         self._sent = False
         self.refusals = 0
         self.status: int | None = None
+        self._warnings = 0
         self._lock = threading.Lock()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC)  # ends a receive in another thread when this link is closed
         self._poll: select.poll | None = None
@@ -119,11 +121,18 @@ class SlcanLink(BaseLink):
         if line.endswith(b"\a"):
             if self._sent:  # before, adapters refuse steps of the set-up that they find needless
                 self.refusals += 1
-                _log.warning("%s: the adapter refused a command; a frame may not have been sent", self._url)
+                self._warn("the adapter refused a command; a frame may not have been sent")
         elif match := _STATUS.fullmatch(line):
             self.status = int(match[1], 16)
         elif line[:1] not in _REPLIES and self._in_step:
-            _log.warning("%s: ignored what is no slcan: %r", self._url, line)
+            self._warn(f"ignored what is no slcan: {line!r}")
+
+    def _warn(self, text: str) -> None:
+        self._warnings += 1
+        if self._warnings <= _WARNINGS:
+            _log.warning("%s: %s", self._url, text)
+        if self._warnings == _WARNINGS:
+            _log.warning("%s: no more of this is told", self._url)
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Send the batch in one write. ValueError for error frames: slcan has none."""

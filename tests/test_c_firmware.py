@@ -111,6 +111,23 @@ def select(frames: Sequence[Frame], *can_ids: int) -> list[Frame]:
     return [frame for frame in frames if frame.can_id in can_ids]
 
 
+def slcan_text(frames: Sequence[Frame]) -> bytes:
+    """The frames as lines of slcan."""
+    lines = []
+    for frame in frames:
+        letter = "tTrR"[frame.is_extended + 2 * frame.is_remote]
+        data = "" if frame.is_remote else frame.data.hex().upper()
+        lines.append(f"{letter}{frame.identifier:0{8 if frame.is_extended else 3}X}{len(frame.data)}{data}\r")
+    return "".join(lines).encode()
+
+
+def slcan_frames(text: bytes) -> list[Frame]:
+    """The frames in lines of slcan; CTRL sends data frames of 11 bits only."""
+    lines = [line.decode() for line in text.split(b"\r") if line.startswith(b"t")]
+    assert all(len(line) == 5 + 2 * int(line[4]) for line in lines)
+    return [Frame(int(line[1:4], 16), bytes.fromhex(line[5:])) for line in lines]
+
+
 # ---- the golden vectors
 
 
@@ -356,6 +373,59 @@ def test_any_bytes_end_the_run_without_a_dose_and_without_a_crash(build: Path, s
         noise[i : i + 4] + bytes([noise[i + 4] % 9]) + noise[i + 5 : i + 16] for i in range(0, 99_984, 16)
     )
     assert not select(answers(build / "firmware_sanitize", records, BUS_LOST), BASAL_CMD)
+
+
+def slcan_answers(program: Path, text: bytes, *statuses: int) -> bytes:
+    """What the C firmware says to this text on its stdin, taken for the serial line of a USB-CAN adapter."""
+    done = subprocess.run([program, "slcan:"], input=text, capture_output=True, timeout=60, check=False)
+    assert done.returncode in statuses, (done.returncode, done.stderr.decode())
+    assert done.stderr == b""
+    return done.stdout
+
+
+def test_slcan_gives_the_same_answers(build: Path) -> None:
+    heard, said = vector()
+    found = slcan_answers(build / "firmware_sanitize", b"C\rS6\r\rO\r" + slcan_text(heard), ENDED)
+    assert found.startswith(b"\r\r\r\rt701")
+    assert slcan_frames(found)[4:] == said
+
+
+def test_slcan_has_the_frames_that_the_hub_has_but_error_frames(build: Path) -> None:
+    heard = [frame for frame in disturbed(vector()[0], 3) if not frame.is_error]
+    assert {frame.is_extended for frame in heard} == {frame.is_remote for frame in heard} == {True, False}
+    found = slcan_answers(build / "firmware_sanitize", b"O\r" + slcan_text(heard), ENDED, BUS_LOST)
+    assert slcan_frames(found) == answers(build / "firmware_sanitize", pack(heard), ENDED, BUS_LOST)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (b"t1230\r", b"\a"),  # the channel is closed
+        (b"V\rS6\rs031C\r\rC\r", b"V0101\r\r\r\r\r"),
+        (b"X\rL\r" + b"O" * 300 + b"\r", b"\a\a\a"),
+        (b"O\rC\r", b"\rt70120000\r\r"),
+        (b"O\rO\rV\r", b"\rt70120000\r\r"),  # another bench: a process does one run, and its bus is lost
+        *[
+            (b"O\r" + line + b"\r", b"\rt70120000\r\a")
+            for line in (
+                b"t", b"t12", b"t123", b"t1239", b"t12310", b"t1231000", b"t123100 ", b"t1231G0", b"t8000",
+                b"t12390011223344556677",
+                b"T1234567", b"T200000000", b"r123100", b"R1FFFFFFF9", b"T0000012380011223344556677889",
+            )
+        ],
+    ],
+)  # fmt: skip
+def test_lines_of_slcan(build: Path, text: bytes, said: bytes) -> None:
+    assert slcan_answers(build / "firmware_sanitize", text, BUS_LOST) == said
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_any_text_ends_the_run_without_a_dose_and_without_a_crash(build: Path, seed: int) -> None:
+    generator = random.Random(seed)
+    alphabet = b"\r\r\rtTrRCOSV0123456789ABCDEFabcdef\a\0\xff" if seed % 2 else bytes(range(256))
+    noise = bytes(generator.choices(alphabet, k=100_000))
+    found = slcan_answers(build / "firmware_sanitize", b"O\r" + noise, BUS_LOST)
+    assert not select(slcan_frames(found), BASAL_CMD)
 
 
 def test_what_came_before_a_goodbye_is_heard_once(build: Path) -> None:

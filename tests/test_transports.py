@@ -858,6 +858,22 @@ def test_slcan_a_garbled_line_is_a_lost_frame(adapter: tuple[int, Link]) -> None
         link.recv(LIMIT)
 
 
+def test_slcan_does_not_tell_of_every_line_of_a_flood(
+    adapter: tuple[int, Link], caplog: pytest.LogCaptureFixture
+) -> None:
+    master, link = adapter
+    os.write(master, b"t1230\r")
+    assert collect(link, 1) == [Frame(0x123, b"")]
+    for _ in range(100):
+        os.write(master, b"assertion failed\r" * 10)
+        assert link.recv(0) == []
+    os.write(master, b"t1240\r")
+    assert collect(link, 1) == [Frame(0x124, b"")]
+    assert "ignored what is no slcan: b'assertion failed'" in caplog.messages[0]
+    assert "no more of this is told" in caplog.messages[-1]
+    assert len(caplog.messages) == 21
+
+
 def test_slcan_a_pulled_adapter_is_loud(adapter: tuple[int, Link]) -> None:
     master, link = adapter
     os.close(master)

@@ -192,17 +192,18 @@ static bool slcan_open(const char *url)
     return true;
 }
 
+/* One frame at a time, so that a command is answered in its place, after the frames before it. */
 static size_t slcan_receive(struct frame frames[TRANSPORT_BATCH])
 {
-    size_t n = 0u;
-    /* wait for the first frame only; a batch is what is there, so that nothing waits for what comes later */
-    while (channel == OPEN && n < TRANSPORT_BATCH && (n == 0u || taken < filled)) {
+    while (channel == OPEN) {
         if (!fill()) {
             return 0u;
         }
-        n += take(input[taken++], &frames[n]) ? 1u : 0u;
+        if (take(input[taken++], &frames[0])) {
+            return 1u;
+        }
     }
-    return n;
+    return 0u;
 }
 
 static bool slcan_send(const struct frame *frames, size_t n)

@@ -8,13 +8,14 @@ joins that port to a bus until the run ends. Without a URL the port is only anno
     examples/c_firmware/cortex_m3/run.py                                       # prints slcan:/dev/pts/7@500000
     pumpbench run --strategy nma --bus slcan:/dev/pts/7@500000 --firmware none
 
-It runs with the Python that has pumpbench. Exit status: 0 the run ended, 2 wrong usage, 3 the bus or the emulator is gone.
+It wants the Python that has pumpbench. Exit status: 0 the run ended, 2 wrong usage, 3 the bus or the emulator is gone.
 """
 
 import argparse
 import contextlib
 import ctypes
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -37,14 +38,18 @@ def end_with_parent() -> None:
 
 @contextlib.contextmanager
 def emulator(qemu: str, kernel: Path) -> Iterator[tuple["subprocess.Popen[str]", str]]:
-    """QEMU with the firmware, and the URL of its UART.
+    """QEMU with the firmware, and the URL of its UART; it ends with the context.
 
     Raises:
-        OSError: it cannot be started; what QEMU has against it is on stderr.
+        OSError: it does not start.
     """
     command = [qemu, *MACHINE, "-kernel", str(kernel)]
     with subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, preexec_fn=end_with_parent
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=end_with_parent,  # noqa: PLW1509, there are no threads here
     ) as process:
         try:
             assert process.stdout is not None
@@ -56,8 +61,12 @@ def emulator(qemu: str, kernel: Path) -> Iterator[tuple["subprocess.Popen[str]",
             process.kill()
 
 
-def join(qemu: str, kernel: Path, bus: str | None) -> None:
-    """Be the device on a bus until the run ends; without a bus, on a serial port until the emulator ends."""
+def run(qemu: str, kernel: Path, bus: str | None) -> None:
+    """Be the device on a bus until the run ends; without a bus, on a serial port for as long as the emulator lives.
+
+    Raises:
+        BusLost, OSError: the bus is gone, or the emulator.
+    """
     with emulator(qemu, kernel) as (process, port):
         if bus is None:
             print(port, flush=True)
@@ -71,10 +80,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bus", nargs="?", metavar="URL", help="the bus to join, e.g. unix:/run/bench.sock")
     parser.add_argument("--kernel", type=Path, default=KERNEL, metavar="FILE", help="the program (build/fw.elf)")
-    parser.add_argument("--qemu", default="qemu-system-arm", metavar="PROGRAM")
+    parser.add_argument("--qemu", default="qemu-system-arm", metavar="PROGRAM", help="the emulator")
     options = parser.parse_args()
+    if shutil.which(options.qemu) is None:
+        parser.error(f"there is no {options.qemu}: install it, or start this through tools/with_arm")
+    if not options.kernel.is_file():
+        parser.error(f"{options.kernel}: no such file; make it with `make -C examples/c_firmware cortex-m3`")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    return exit_status("cortex_m3", lambda: join(options.qemu, options.kernel, options.bus))
+    return exit_status("cortex_m3", lambda: run(options.qemu, options.kernel, options.bus))
 
 
 if __name__ == "__main__":
