@@ -84,13 +84,19 @@ def port(build: Path) -> Iterator[serial.Serial]:
             yield opened
 
 
-def answers(port: serial.Serial, heard: Sequence[Frame]) -> list[Frame]:
-    """What the board says to these frames, from the opening of its channel on."""
-    text = b"C\rO\r" + slcan_text(heard) + b"V\r"  # the version comes when everything before it is answered
+@contextlib.contextmanager
+def writing(port: serial.Serial, text: bytes) -> Iterator[None]:
+    """Write while the caller reads; neither end of the line holds all of it."""
     writer = threading.Thread(target=port.write, args=(text,))
     writer.start()
-    said = port.read_until(b"V0101\r")
+    yield
     writer.join()
+
+
+def answers(port: serial.Serial, heard: Sequence[Frame], before: bytes = b"C\r") -> list[Frame]:
+    """What the board says to these frames, from the opening of its channel on."""
+    with writing(port, before + b"O\r" + slcan_text(heard) + b"V\r"):
+        said = port.read_until(b"V0101\r")  # the version comes when everything before it is answered
     assert said.endswith(b"V0101\r")
     return slcan_frames(said)
 
@@ -103,6 +109,22 @@ def test_the_golden_vectors(port: serial.Serial) -> None:
     found = answers(port, heard)[4:]  # HB_CTRL of the start; HB_CTRL, CTRL_Info, SYNC_Done
     assert len(select(said, BASAL_CMD)) == 288
     assert found == said
+
+
+def test_a_board_whose_bench_does_not_read_loses_nothing(port: serial.Serial) -> None:
+    """It cannot send, its buffer of what came is full, and the line is held up: all of it goes on from there."""
+    lines = random.Random(1).choices([b"", b"V"], k=20_000)
+    with writing(port, b"C\r" + b"".join(line + b"\r" for line in lines)):
+        time.sleep(3.0)  # to let it come to that
+        expected = b"\r" + b"".join(b"V0101\r" if line else b"\r" for line in lines)
+        assert port.read(len(expected)) == expected
+
+
+def test_a_bench_that_was_killed_left_the_channel_open(port: serial.Serial) -> None:
+    heard, said = vector()
+    found = answers(port, heard, before=b"C\rO\r" + slcan_text(heard[:500]))
+    assert found[-len(said) :] == said
+    assert [frame for frame in found if frame == found[0]][:4] == [found[0]] * 4  # two starts and two roll calls
 
 
 @pytest.mark.parametrize("seed", range(5))
