@@ -404,7 +404,8 @@ def test_slcan_has_the_frames_that_the_hub_has_but_error_frames(build: Path) -> 
         (b"V\rS6\rs031C\r\rC\r", b"V0101\r\r\r\r\r"),
         (b"X\rL\r" + b"O" * 300 + b"\r", b"\a\a\a"),
         (b"O\rC\r", b"\rt70120000\r\r"),
-        (b"O\rO\rV\r", b"\rt70120000\r\r"),  # another bench: a process does one run, and its bus is lost
+        (b"O\rO\rV\r", b"\rt70120000\r\rV0101\r"),  # python-can opens twice
+        (b"O\rt1230\rO\rV\r", b"\rt70120000\r\r"),  # another bench: a process does one run, and its bus is lost
         *[
             (b"O\r" + line + b"\r", b"\rt70120000\r\a")
             for line in (

@@ -15,8 +15,9 @@
 #define STANDARD_ID_MASK 0x7FFu
 #define LINE_MAX_LENGTH (1u + EXTENDED_DIGITS + 1u + 2u * FRAME_DATA_MAX) /* without its CR */
 
-/* A channel that is opened again without having been closed belongs to a new bench: the one before was killed. */
-static enum { CLOSED, OPEN, OPENED_AGAIN } channel;
+/* A channel in use that is opened again without having been closed belongs to a new bench: the one before was killed.
+ * One that nobody has used yet may be opened twice: python-can does. */
+static enum { CLOSED, OPEN, IN_USE, OPENED_AGAIN } channel;
 
 static uint8_t input[256];
 static size_t taken, filled; /* of the input */
@@ -108,6 +109,11 @@ static bool read_frame(struct frame *frame)
     return true;
 }
 
+static bool is_open(void)
+{
+    return channel == OPEN || channel == IN_USE;
+}
+
 /* Obey the line; true if it is a frame, and the channel is open. */
 static bool read_line(struct frame *frame)
 {
@@ -120,13 +126,14 @@ static bool read_line(struct frame *frame)
     case 'T':
     case 'r':
     case 'R':
-        if (channel == OPEN && read_frame(frame)) {
+        if (is_open() && read_frame(frame)) {
+            channel = IN_USE;
             return true;
         }
         answer(BEL);
         return false;
     case 'O':
-        channel = channel == CLOSED ? OPEN : OPENED_AGAIN;
+        channel = channel == IN_USE || channel == OPENED_AGAIN ? OPENED_AGAIN : OPEN;
         break;
     case 'C':
         channel = CLOSED;
@@ -195,7 +202,7 @@ static bool slcan_open(const char *url)
 /* One frame at a time, so that a command is answered in its place, after the frames before it. */
 static size_t slcan_receive(struct frame frames[TRANSPORT_BATCH])
 {
-    while (channel == OPEN) {
+    while (is_open()) {
         if (!fill()) {
             return 0u;
         }
@@ -219,7 +226,7 @@ static bool slcan_send(const struct frame *frames, size_t n)
 /* The run is over for this device, the other end will close the channel some time. */
 static void slcan_close(void)
 {
-    if (channel == OPEN) {
+    if (is_open()) {
         channel = CLOSED;
     }
 }
