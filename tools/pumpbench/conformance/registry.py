@@ -26,10 +26,6 @@ class NotOffered(Exception):
     """The device turns out, within a check, not to have what it takes; the text says what. No failure."""
 
 
-class NotOffered(Exception):
-    """The device turns out, within a check, not to have what it takes; the text says what. No failure."""
-
-
 class Dut:
     """The device under test as a check sees it.
 
