@@ -7,7 +7,7 @@ from can_bus import codec
 from can_bus.codec import Receiver
 from can_bus.faults.nodes import MemoryState
 from can_bus.frame import Frame
-from can_bus.lockstep import STEP_SECONDS
+from can_bus.lockstep import STEP_SECONDS, Node
 from pumpbench.calibration import MODES
 from pumpbench.conformance.checks.e2e import carbs_mode, idle_boluses
 from pumpbench.conformance.checks.ladder import (
@@ -74,8 +74,8 @@ class _Cut:
 
     finished = False
 
-    def __init__(self, dut: Dut, loop: Loop, when: Callable[[str, Values], bool]) -> None:
-        self._dut, self._device, self._when = dut, loop.device, when
+    def __init__(self, dut: Dut, device: Node, when: Callable[[str, Values], bool]) -> None:
+        self._dut, self._device, self._when = dut, device, when
         self.done = False
 
     def receive(self, frame: Frame) -> Sequence[Frame]:
@@ -91,7 +91,7 @@ def _meal(dut: Dut, when: Callable[[str, Values], bool] = lambda *_: False) -> L
     """A meal, and the power cut at a frame of it."""
     strategy = carbs_mode(dut)
     loop = dut.loop(strategy or "nma", [(MEAL, 60.0)], MEAL + 12)
-    loop.device = _Cut(dut, loop, when)
+    loop.device = _Cut(dut, loop.device, when)
     return loop.play()
 
 
