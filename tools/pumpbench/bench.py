@@ -187,7 +187,7 @@ class Outcome:
         return self.trace.alarms
 
     def raised(self, code: str | None = None, node: str | None = None) -> list[AlarmEvent]:
-        """The alarms as they were raised: the first event of every instance; a device without memory gives them anew."""
+        """The alarms as they were raised: first events of instances, which a device without memory gives anew."""
         standing: set[tuple[str, int]] = set()
         found = []
         for event in self.trace.alarms:
