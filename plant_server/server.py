@@ -171,7 +171,6 @@ class PlantServer:
     def call_roll(self) -> list[Frame]:
         """The next roll call; to be repeated until `receive` has an answer."""
         self._call += 1
-        self._receiver.reset()  # a device starts its counters anew with every call it answers
         major, minor = dbc.protocol_version()
         return [
             self._roll.frame("PLANT_Info", PlantProtocolMajor=major, PlantProtocolMinor=minor, PlantDbcCrc=dbc.crc32()),
@@ -222,7 +221,7 @@ class PlantServer:
         if values["DoneStepIndex"] != expected:
             if self._phase == Phase.INIT:
                 self.late_answers += 1
-                self._receiver.reset()  # of an earlier call: the device counts from 0 again when it answers the next
+                self._receiver.reset()  # the device counts from 0 again when it answers the next call
             return []
         if self._phase == Phase.INIT:
             warning = judge_version(self._version, values["DoneStatus"])
