@@ -187,6 +187,14 @@ def ids_and_retries(dut: Dut) -> None:
         loop.play()
         expect_ids_and_retries(loop, sends)
         expect(bool(programs(loop)), "a bolus for a meal; none was programmed")
+        for step in {each.step for each in programs(loop)}:  # every try for a meal is the same bolus
+            tries = [each for each in programs(loop) if each.step == step]
+            drugs = {each.drug for each in tries}
+            ids = [each.number for each in tries]
+            expect(
+                len(ids) == len(drugs),
+                f"one BolusId for each drug in step {step}, however often it is said; {ids} came",
+            )
     if "restart" not in dut.offers:
         raise NotOffered("restart")
     for answer in range(1, 3):  # the one to Program, the one to Commit
