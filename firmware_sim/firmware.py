@@ -26,6 +26,7 @@ from .control.core import control_step
 from .control.fixed import Ints, round_divide
 from .control.layout import MODE_OFF, MODE_S4
 from .day import Day
+from .e2e_window import E2eWindow
 from .isotp import IsoTp
 from .ladder import AGE_DEGRADED, PUMP_SILENT, Ladder, State
 from .meals import Meals
@@ -104,6 +105,9 @@ class Cause(enum.IntEnum):
     PIN = 4
 
 
+CYCLIC = ("CGM_Reading", "PUMP_Status", "PUMP_Delivered")
+"""Messages of every step whose values are used only while `E2eWindow` calls them valid (requirement E2E-03)."""
+
 DIAGNOSTICS = "UDS_Request"
 """The one message that is answered out of turn, and that no task sees."""
 
@@ -147,6 +151,8 @@ class Firmware:
             "PUMP_BolusState": self._on_bolus_state,
             "CGM_Status": self._on_cgm_status,
             "MEAL_Announce": self._on_meal_announce,
+            "HB_PUMP": lambda _values: self._heartbeats.add("HB_PUMP"),
+            "HB_CGM": lambda _values: self._heartbeats.add("HB_CGM"),
         }
         self._boot()
         record = None if self._nvm is None else self._nvm.load()
@@ -159,6 +165,7 @@ class Firmware:
         """Everything as after power-on."""
         self._transmitter = Transmitter()
         self._receiver = Receiver(name for name in subscriptions() if name != DIAGNOSTICS)
+        self._windows = {name: E2eWindow() for name in CYCLIC}
         self._isotp = IsoTp()
         self._uds = Uds(self)
         self._turn = Turn(self._transmitter)
@@ -184,6 +191,7 @@ class Firmware:
         self._totals_known = False  # in the step before
         self._short_seen = dict.fromkeys(Drug, 0)
         self._status: dict[str, int] | None = None
+        self._heartbeats: set[str] = set()  # heard since the last step
         self._bolus_states: set[int] = set()  # drugs heard of in this step
         self._rejected = False
         self._scheduler = Scheduler(self._tasks())
@@ -235,6 +243,9 @@ class Firmware:
             self._impostors += 1  # a node never hears itself
         self._bus_errors += frame.is_error
         self._frames_heard += check != Check.UNKNOWN
+        window = self._windows.get(name)
+        if window is not None:
+            window.hear(check)
         if check > Check.OK_SOME_LOST:
             if check in (Check.REPEATED, Check.WRONG_SEQUENCE) and name == "CGM_Reading":
                 self._cgm.skip()
@@ -404,7 +415,25 @@ class Firmware:
         if self._impostors > self._impostors_seen:
             self._impostors_seen = self._impostors
             self._last_impostor = self._now
+        self._drop_invalid()
+        if "HB_CGM" in self._heartbeats:
+            self._cgm.heartbeat(self._now)
+        if "HB_PUMP" in self._heartbeats:
+            self._pump.heartbeat(self._now)
+        self._heartbeats.clear()
         return frames
+
+    def _drop_invalid(self) -> None:
+        """Treat what came of a message that is not valid as if it had not come."""
+        valid = {name: window.close() for name, window in self._windows.items()}
+        if not valid["CGM_Reading"]:
+            for _ in self._samples:
+                self._cgm.skip()
+            self._samples = []
+        if not valid["PUMP_Status"]:
+            self._status = None
+        if not valid["PUMP_Delivered"]:
+            self._totals = None
 
     def _task_sensor(self) -> int:
         samples = len(self._samples)
@@ -428,7 +457,7 @@ class Firmware:
         self._ladder.update(
             calibrated=self._calibration.active,
             suspended=self._suspended or self._mode == MODE_OFF,
-            age=self._cgm.age(step),
+            age=max(self._cgm.age(step), AGE_DEGRADED if self._cgm.silent(step) else 0),
             streak=self._cgm.streak,
             pump_age=self._pump.age(step),
             uncertain=self._boluses.uncertain,

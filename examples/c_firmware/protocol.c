@@ -51,6 +51,25 @@ static unsigned find(uint32_t can_id)
     return index;
 }
 
+/* Let the supervisor know what became of a frame of the messages whose checks it follows. */
+static void note(struct firmware *firmware, unsigned index, enum verdict verdict)
+{
+    switch (index) {
+    case MESSAGE_CGM_READING:
+        supervisor_note(&firmware->supervisor, CYCLIC_READING, verdict);
+        break;
+    case MESSAGE_PUMP_STATUS:
+        supervisor_note(&firmware->supervisor, CYCLIC_STATUS, verdict);
+        break;
+    case MESSAGE_PUMP_DELIVERED:
+        supervisor_note(&firmware->supervisor, CYCLIC_TOTALS, verdict);
+        break;
+    default:
+        break;
+    }
+}
+
+
 /* Whether a frame may be read, and which message it is; what it may not is counted and has no other effect. */
 static bool check(struct firmware *firmware, const struct frame *frame, unsigned *index)
 {
@@ -71,6 +90,7 @@ static bool check(struct firmware *firmware, const struct frame *frame, unsigned
     firmware->frames_heard++;
     if (flagged || frame->len != MESSAGE[i].length) {
         firmware->e2e_errors++;
+        note(firmware, i, VERDICT_BAD);
         return false;
     }
     if (!MESSAGE[i].is_protected) {
@@ -78,6 +98,7 @@ static bool check(struct firmware *firmware, const struct frame *frame, unsigned
     }
     if (frame->data[0] != e2e_checksum(frame->data, frame->len, MESSAGE[i].data_ids)) {
         firmware->e2e_errors++;
+        note(firmware, i, VERDICT_BAD);
         return false;
     }
     const uint8_t counter = frame->data[1] & COUNTER_MASK;
@@ -91,8 +112,10 @@ static bool check(struct firmware *firmware, const struct frame *frame, unsigned
         if (i == MESSAGE_CGM_READING) {
             supervisor_skip_reading(&firmware->supervisor);
         }
+        note(firmware, i, step == 0u ? VERDICT_REPEATED : VERDICT_BAD);
         return false;
     }
+    note(firmware, i, VERDICT_GOOD);
     return true;
 }
 
@@ -300,7 +323,13 @@ bool firmware_receive(struct firmware *firmware, const struct frame *in, struct 
         }
         return true;
     }
-    default: /* heartbeats and the pump's alarms are checked and counted; meals mean nothing to mode nma */
+    case MESSAGE_HB_CGM:
+        supervisor_hear_heartbeat_cgm(supervisor);
+        return true;
+    case MESSAGE_HB_PUMP:
+        supervisor_hear_heartbeat_pump(supervisor);
+        return true;
+    default: /* the pump's alarms are checked and counted; meals mean nothing to mode nma */
         return true;
     }
 }

@@ -26,6 +26,7 @@ static bool has_bit(uint32_t bits, unsigned bit)
 #define SETTLING_SAMPLES 3u       /* in a row after a gap before trends are trusted again */
 #define JUMP 500                  /* 0.1 mg/dL in a step: a rise above waits for the next sample; a fall never waits */
 #define NOISE_HIGH 30u            /* CgmNoise, 0.5 mg/dL */
+#define HEARTBEATS_MISSED 3       /* steps without HB_CGM, once it was heard, after which the sensor is silent */
 #define FAULT_BITS (1u | 2u | 8u) /* noise, compression low, calibration error */
 
 void supervisor_hear_reading(struct supervisor *supervisor, const struct pumpbench_cgm_reading_t *reading)
@@ -41,6 +42,17 @@ void supervisor_skip_reading(struct supervisor *supervisor)
 {
     /* after a gap it is a sample, unused but not lost; beside a usable sample it is a copy */
     supervisor->sensor.skipped++;
+}
+
+void supervisor_hear_heartbeat_cgm(struct supervisor *supervisor)
+{
+    supervisor->sensor.alive_came = true;
+}
+
+/* Whether the sensor's heartbeat has stopped (requirement E2E-07). */
+static bool is_silent(const struct sensor *sensor, int32_t step)
+{
+    return sensor->alive != NEVER && step - sensor->alive >= HEARTBEATS_MISSED;
 }
 
 void supervisor_hear_cgm_status(struct supervisor *supervisor, const struct pumpbench_cgm_status_t *status)
@@ -235,10 +247,18 @@ bool supervisor_hear_ack(struct supervisor *supervisor, const struct pumpbench_p
     return !accepted || !pump->rates_sent || ack->ack_echo_raw == asked;
 }
 
-/* Steps since status, totals and the states of boluses were last heard; of these states, those ever heard. */
+void supervisor_hear_heartbeat_pump(struct supervisor *supervisor)
+{
+    supervisor->pump.alive_came = true;
+}
+
+/* Steps since status, totals, heartbeat and the states of boluses were last heard; of the latter two, those ever heard. */
 static int32_t silence_of_pump(const struct pump *pump, int32_t step)
 {
     int32_t heard = pump->status_step < pump->totals_step ? pump->status_step : pump->totals_step;
+    if (pump->alive != NEVER && pump->alive < heard) {
+        heard = pump->alive;
+    }
     for (unsigned drug = 0u; drug < HORMONES; drug++) {
         if (has_bit(pump->bolus_states_heard, drug) && pump->bolus_step[drug] < heard) {
             heard = pump->bolus_step[drug];
@@ -415,7 +435,10 @@ static enum ladder_state next_rung(enum ladder_state rung, int32_t age, uint32_t
 
 static void climb(struct supervisor *supervisor, int32_t step, const struct calibration *calibration)
 {
-    const int32_t age = age_of_sample(&supervisor->sensor, step);
+    int32_t age = age_of_sample(&supervisor->sensor, step);
+    if (is_silent(&supervisor->sensor, step) && age < AGE_DEGRADED) {
+        age = AGE_DEGRADED;
+    }
     const uint32_t streak = supervisor->sensor.streak;
     /* CfgStaleCgmLimit as an age in steps; it can only tighten (requirement USR-05) */
     const int32_t stale = calibration->supervision.stale_cgm_limit / 5 + 1;
@@ -479,6 +502,62 @@ void supervisor_hear_alarm_ack(struct supervisor *supervisor, const struct pumpb
     const bool snooze = ack->alarm_ack_action == PUMPBENCH_UI_ALARM_ACK_ALARM_ACK_ACTION_SNOOZE_CHOICE;
     if (ack->alarm_ack_node == PUMPBENCH_UI_ALARM_ACK_ALARM_ACK_NODE_CTRL_CHOICE && (confirm || snooze)) {
         alarms_acknowledge(&supervisor->alarms, ack->alarm_ack_instance, confirm);
+    }
+}
+
+/* ---- whether a message may be used at all (requirement E2E-03) */
+
+#define WINDOW_MASK 0xFu  /* the last four checks count */
+#define ERRORS_AT_MOST 1u /* of them, with which a message is still valid, or becomes so */
+#define OK_TO_RETURN 2u   /* after a disturbance one good frame may be chance */
+
+void supervisor_note(struct supervisor *supervisor, enum cyclic message, enum verdict verdict)
+{
+    struct window *window = &supervisor->windows[message];
+    window->good_came = window->good_came || verdict == VERDICT_GOOD;
+    window->repeated_came = window->repeated_came || verdict == VERDICT_REPEATED;
+    window->bad_came = window->bad_came || verdict == VERDICT_BAD;
+}
+
+static unsigned count_bits(uint8_t bits)
+{
+    unsigned count = 0u;
+    for (; bits != 0u; bits &= (uint8_t)(bits - 1u)) {
+        count++;
+    }
+    return count;
+}
+
+/* Check what came since the last step; whether it may be used. A step without a frame is no check. */
+static bool close_window(struct window *window)
+{
+    if (window->good_came || window->repeated_came || window->bad_came) {
+        const bool bad = window->bad_came && !window->good_came;
+        window->good = (uint8_t)((window->good << 1 | (window->good_came ? 1u : 0u)) & WINDOW_MASK);
+        window->bad = (uint8_t)((window->bad << 1 | (bad ? 1u : 0u)) & WINDOW_MASK);
+        window->good_came = window->repeated_came = window->bad_came = false;
+        const unsigned needed = window->state == WINDOW_INVALID ? OK_TO_RETURN : 1u;
+        if (count_bits(window->good) >= needed && count_bits(window->bad) <= ERRORS_AT_MOST) {
+            window->state = WINDOW_VALID;
+        } else if (window->state == WINDOW_VALID) {
+            window->state = WINDOW_INVALID;
+        }
+    }
+    return window->state == WINDOW_VALID;
+}
+
+/* What came of a message that is not valid is as if it had not come. */
+static void drop_invalid(struct supervisor *supervisor)
+{
+    if (!close_window(&supervisor->windows[CYCLIC_READING])) {
+        supervisor->sensor.skipped += supervisor->sensor.heard;
+        supervisor->sensor.heard = 0u;
+    }
+    if (!close_window(&supervisor->windows[CYCLIC_STATUS])) {
+        supervisor->pump.status_came = false;
+    }
+    if (!close_window(&supervisor->windows[CYCLIC_TOTALS])) {
+        supervisor->pump.totals_came = false;
     }
 }
 
@@ -678,6 +757,17 @@ static void report_status(const struct supervisor *supervisor, const struct link
     report->diag.saturation_count = at_most(supervisor->control.saturations, 1023u);
 }
 
+static void take_heartbeats(struct supervisor *supervisor, int32_t step)
+{
+    if (supervisor->sensor.alive_came) {
+        supervisor->sensor.alive = step;
+    }
+    if (supervisor->pump.alive_came) {
+        supervisor->pump.alive = step;
+    }
+    supervisor->sensor.alive_came = supervisor->pump.alive_came = false;
+}
+
 /* Work is counted, not timed, so that it is the same on every machine; more than a budget is an overrun. */
 static void count_work(struct supervisor *supervisor, uint32_t frames, uint32_t samples)
 {
@@ -688,6 +778,8 @@ static void count_work(struct supervisor *supervisor, uint32_t frames, uint32_t 
 void supervisor_step(struct supervisor *supervisor, int32_t step, uint32_t sim_time,
                      const struct calibration *calibration, const struct link_counts *counts, struct report *report)
 {
+    drop_invalid(supervisor);
+    take_heartbeats(supervisor, step);
     const int32_t skipped = supervisor->step < 0 ? 0 : step - supervisor->step - 1;
     const uint32_t samples = supervisor->sensor.heard;
     supervisor->step = step;
@@ -724,11 +816,11 @@ void supervisor_boot(struct supervisor *supervisor)
 {
     memset(supervisor, 0, sizeof *supervisor);
     struct sensor *sensor = &supervisor->sensor;
-    sensor->sequence = sensor->taken = NEVER;
+    sensor->sequence = sensor->taken = sensor->alive = NEVER;
     sensor->last = sensor->unconfirmed = sensor->value_last = -1;
     sensor->session = PUMPBENCH_CGM_STATUS_CGM_SESSION_ID_SNA_CHOICE;
     struct pump *pump = &supervisor->pump;
-    pump->status_step = pump->totals_step = NEVER;
+    pump->status_step = pump->totals_step = pump->alive = NEVER;
     pump->sequence = SEQUENCES_BASAL - 1;
     pump->commanded = SCHEDULE;
     pump->rate_limit = RATE_MAX;

@@ -27,6 +27,19 @@ enum ladder_state {
     LADDER_DELIVERY_UNCERTAIN = PUMPBENCH_CTRL_STATUS_CTRL_STATE_DELIVERY_UNCERTAIN_CHOICE
 };
 
+/* The messages of every step whose values are used only while their last checks allow it (requirement E2E-03). */
+enum cyclic { CYCLIC_READING, CYCLIC_STATUS, CYCLIC_TOTALS, CYCLIC_MESSAGES };
+
+/* What E2E says of a frame: it may be read; the last one again, old but no error; not to be read. */
+enum verdict { VERDICT_GOOD, VERDICT_REPEATED, VERDICT_BAD };
+
+/* The window over the last checks of a message, one in every step in which something of it came. */
+struct window {
+    enum { WINDOW_NO_DATA, WINDOW_VALID, WINDOW_INVALID } state;
+    bool good_came, repeated_came, bad_came; /* since the last check */
+    uint8_t good, bad;                       /* a bit per check, the newest lowest */
+};
+
 /* The CGM as the firmware sees it. */
 struct sensor {
     struct pumpbench_cgm_reading_t samples[SAMPLES_MAX]; /* of this step, checked by E2E */
@@ -44,6 +57,8 @@ struct sensor {
     uint32_t unused;        /* frames since the newest usable sample that came and could not be used */
     uint32_t streak;        /* steps in a row with a usable sample */
     uint32_t since_gap;     /* usable samples since the last long gap */
+    bool alive_came;        /* a heartbeat, in this step */
+    int32_t alive;          /* step of the newest one, NEVER before the first: then none is missed */
 };
 
 /* The pump as the firmware sees it. */
@@ -54,6 +69,8 @@ struct pump {
     uint16_t bolus_states_came;    /* in this step, a bit per drug */
     int32_t status_step, totals_step, bolus_step[HORMONES]; /* when they were last heard, NEVER before the first */
     uint16_t bolus_states_heard;   /* ever, a bit per drug */
+    bool alive_came;               /* a heartbeat, in this step */
+    int32_t alive;                 /* step of the newest one, NEVER before the first: then none is missed */
     bool blocked;                  /* the insulin line or its motor does not deliver */
     uint32_t unlike;               /* steps in a row in which the pump showed another set-point than the last one */
     int32_t sequence;              /* BasalCmdSeq of the last set-point */
@@ -80,6 +97,7 @@ struct day {
 };
 
 struct supervisor {
+    struct window windows[CYCLIC_MESSAGES];
     struct sensor sensor;
     struct pump pump;
     struct day day;
@@ -134,6 +152,9 @@ void supervisor_boot(struct supervisor *supervisor);
 /* Frames between two tokens, checked by E2E. */
 void supervisor_hear_reading(struct supervisor *supervisor, const struct pumpbench_cgm_reading_t *reading);
 void supervisor_skip_reading(struct supervisor *supervisor); /* one that E2E does not allow to read */
+void supervisor_note(struct supervisor *supervisor, enum cyclic message, enum verdict verdict);
+void supervisor_hear_heartbeat_cgm(struct supervisor *supervisor);
+void supervisor_hear_heartbeat_pump(struct supervisor *supervisor);
 void supervisor_hear_cgm_status(struct supervisor *supervisor, const struct pumpbench_cgm_status_t *status);
 void supervisor_hear_pump_status(struct supervisor *supervisor, const struct pumpbench_pump_status_t *status);
 void supervisor_hear_delivered(struct supervisor *supervisor, const struct pumpbench_pump_delivered_t *totals);

@@ -13,6 +13,8 @@ from can_bus.hub import Hub
 from can_bus.link import Link
 from can_bus.url import open_link
 from pumpbench.conformance.device import Device, Remote
+from pumpbench.conformance.registry import Need
+from pumpbench.node import Process
 from pumpbench.rig import SOMEBODY_ELSES, Child, NodeDied, RigError, firmware_command
 
 RESET_SECONDS = 30.0
@@ -26,8 +28,8 @@ def connected(
     *,
     timeout: float = 5.0,
     reset_hook: str | None = None,
-) -> Iterator[tuple[Device, bool]]:
-    """A device, and whether its memory can be lost or torn from outside.
+) -> Iterator[tuple[Device, frozenset[Need]]]:
+    """A device, and what is known of its memory: whether it keeps one, and whether it can be lost or torn from outside.
 
     Args:
         bus: `inproc`, `hub`, or the URL of the device's bus.
@@ -44,7 +46,7 @@ def connected(
             raise RigError("--bus inproc is the reference firmware in this process; for another one give --bus hub")
         from pumpbench.conformance.reference import reference  # noqa: PLC0415
 
-        yield reference(), True
+        yield reference(), frozenset({"nvm", "memory"})
         return
     if bus == "hub" and firmware == SOMEBODY_ELSES:
         raise RigError("a device that runs by itself needs the bus it is on: give its URL with --bus")
@@ -56,13 +58,15 @@ def connected(
         link = stack.enter_context(open_link(url))
         if firmware == SOMEBODY_ELSES:
             restart = None if reset_hook is None else _hook(reset_hook, url)
-            yield Remote(link, timeout=timeout, restart=restart), False
+            yield Remote(link, timeout=timeout, restart=restart), frozenset({"nvm"})
         else:
             yield stack.enter_context(_started(link, url, firmware, place, timeout))
 
 
 @contextlib.contextmanager
-def _started(link: Link, url: str, firmware: str | None, place: Path, timeout: float) -> Iterator[tuple[Device, bool]]:
+def _started(
+    link: Link, url: str, firmware: str | None, place: Path, timeout: float
+) -> Iterator[tuple[Device, frozenset[Need]]]:
     """A device as a child process, which has a memory where its command has a place for one."""
     nvm = place / "nvm"
     keeps = firmware is None or "{nvm}" in firmware
@@ -72,22 +76,19 @@ def _started(link: Link, url: str, firmware: str | None, place: Path, timeout: f
             command = firmware_command(firmware, url, nvm if keeps else None, memory)
             return Child("firmware", command, os.environ | {"PUMPBENCH_BUS": url}, log, ready=False)
 
-        child = launch("kept")
+        process = Process(launch, nvm)
 
         def restart(memory: MemoryState) -> None:
-            nonlocal child
-            child.kill()
-            if memory == "lost":
-                nvm.unlink(missing_ok=True)
-            child = launch(memory)
+            process.cut()
+            process.start(memory)
 
-        def watch() -> None:
-            child.check()  # whichever it is by now
-
+        offers: set[Need] = {"nvm"} if keeps else set()
+        if firmware is None:
+            offers.add("memory")  # of another firmware nobody knows what a torn one looks like
         try:
-            yield Remote(link, timeout=timeout, watch=watch, restart=restart), keeps
+            yield Remote(link, timeout=timeout, watch=process.check, restart=restart), frozenset(offers)
         finally:
-            child.end()
+            process.child.end()
 
 
 def _hook(command: str, url: str) -> Callable[[MemoryState], None]:

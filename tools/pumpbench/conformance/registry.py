@@ -14,9 +14,9 @@ from pumpbench.conformance.driver import NMA, Bench
 from pumpbench.conformance.loop import Loop
 from pumpbench.conformance.settings import Settings
 
-Need = Literal["nma", "sma", "ma", "s1", "s2", "s3", "s4", "boluses", "pramlintide", "restart", "memory", "uds"]
+Need = Literal["nma", "sma", "ma", "s1", "s2", "s3", "s4", "boluses", "pramlintide", "restart", "nvm", "memory", "uds"]
 """What a check can need of a device: a mode, any mode with boluses or with pramlintide, that it can be started anew,
-that its memory can be erased or torn from outside, UDS."""
+that it keeps a memory meanwhile, that this can be erased or torn from outside, UDS."""
 
 MEALTIME: tuple[Need, ...] = ("ma", "s3", "sma", "s4")
 """Modes that answer a meal with a bolus of insulin, any of which is what "boluses" needs."""

@@ -93,7 +93,7 @@ def run(
     settings: Settings,
     *,
     wanted: Sequence[Requirement] | None = None,
-    memory: bool = True,
+    memory: frozenset[Need] = frozenset({"nvm", "memory"}),
     long: bool = False,
     must: Iterable[str] = (),
     patience: float = 10.0,
@@ -105,7 +105,7 @@ def run(
         device: what is tested.
         settings: thresholds.
         wanted: the requirements to check; default: all.
-        memory: whether the device's memory can be lost or torn at a restart.
+        memory: of "nvm" and "memory" what holds, for this cannot be found by trying.
         long: use the long form of checks that have one.
         must: modes that it has to take up, whether or not it does.
         patience: seconds to wait for the first answer.
@@ -167,7 +167,7 @@ def _revive(device: Device) -> bool:
     return False
 
 
-def _offers(device: Device, must: Iterable[str], *, memory: bool) -> frozenset[Need]:
+def _offers(device: Device, must: Iterable[str], *, memory: frozenset[Need]) -> frozenset[Need]:
     """What the device can do, by trying: modes it takes up, restarts, UDS."""
     asked = set(must)
     found: set[Need] = {
@@ -178,9 +178,7 @@ def _offers(device: Device, must: Iterable[str], *, memory: bool) -> frozenset[N
     if found.intersection(PRAMLINTIDE):
         found.add("pramlintide")
     if device.can_restart:
-        found.add("restart")
-        if memory:
-            found.add("memory")
+        found |= {"restart", *memory}
     try:
         if device.receive(Frame(codec.message("UDS_Request").can_id, TESTER_PRESENT)):
             found.add("uds")

@@ -130,7 +130,7 @@ def _expect_safe(loop: Loop, calm: Loop, what: str) -> None:
 # ---- the checks
 
 
-@check("RST-01", needs=["restart"])
+@check("RST-01", needs=["restart", "nvm"])
 def power_cuts(dut: Dut) -> None:
     """Restarts between two steps and at any frame of a step: mode, IOB, numbers, limits, suspension and alarms stay.
 
@@ -210,7 +210,7 @@ def _suspension_and_alarms_are_kept(dut: Dut) -> None:
     expect_state(bench.step(), State.SUSPENDED, "after a restart, as the user has it")
 
 
-@check("RST-02", needs=["restart", "memory"])
+@check("RST-02", needs=["restart", "nvm", "memory"])
 def a_damaged_memory(dut: Dut) -> None:
     """A record that is half written: mode and IOB as before. Nothing left: the schedule at most, and no bolus.
 
@@ -282,7 +282,7 @@ def _announced(bench: Bench, meal: int, held: str = "") -> Turn:
     return bench.step(HIGH, status=held != "PUMP_Status", totals=held != "PUMP_Delivered", also=[meal_frame, *states])
 
 
-@check("RST-04", needs=["restart"])
+@check("RST-04", needs=["restart", "nvm"])
 def resets_are_told(dut: Dut) -> None:
     """Restarts in a row: each is told by heartbeat and NodeReset; too many hold SafeBasal until the user resumes."""
     resets = dut.settings.reset.resets
