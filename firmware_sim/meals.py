@@ -29,13 +29,15 @@ class Meals:
     def hear(self, values: dict[str, int]) -> None:
         """A MEAL_Announce. One is taken per step; another one is repeated by the user until it is echoed."""
         number, kind = values["MealId"], values["MealKind"]
-        if number >= IDS or number == self.last or self._waiting is not None:
+        if kind == CANCEL and number == self.last:
+            self._waiting = None  # a meal of this step; one of an earlier step is dosed
+        if number >= IDS or number == self.last or (self._waiting is not None and kind != CANCEL):
             return
         if self.last is not None and (number - self.last) % IDS > IDS // 2:
             self.repeated += 1
             return
         carbs = values["CarbsEst"]
-        if kind in (HYPO_TREATMENT, CANCEL):  # a bolus is committed within its step: there is nothing left to cancel
+        if kind in (HYPO_TREATMENT, CANCEL):  # a bolus is committed within its step: only what waits can be cancelled
             self._waiting = MEAL_NONE, 0
         elif kind not in (MEAL_CARBS, MEAL_SIMPLE, MEAL_SNACK) or abs(values["MealOffset"]) > OFFSET_MAX:
             self._waiting = MEAL_NONE, 0

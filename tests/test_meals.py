@@ -79,6 +79,17 @@ def test_what_gives_no_bolus_takes_its_step_too(kind: int) -> None:
     assert meals.take() == (CARBS, 80)
 
 
+@pytest.mark.parametrize(("number", "left"), [(7, NOTHING), (8, NOTHING), (255, (CARBS, 80)), (6, (CARBS, 80))])
+def test_a_meal_of_this_step_can_be_cancelled(number: int, left: tuple[int, int]) -> None:
+    """By its own number or a newer one."""
+    meals = hear(announced(7))
+    meals.hear(announced(number, CANCEL))
+    assert meals.take() == left
+    assert meals.last == max(number % 255, 7)
+    meals.hear(announced(7, CANCEL))  # of what was taken nothing is left to cancel
+    assert meals.take() == NOTHING
+
+
 def test_no_mix_of_repeated_and_late_announcements_doses_a_meal_twice() -> None:
     source = random.Random(5)
     meals, taken, said = Meals(), [], 0

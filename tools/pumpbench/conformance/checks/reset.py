@@ -63,7 +63,7 @@ def with_insulin(dut: Dut, **how: object) -> Bench:
 # ---- power cuts within a meal
 
 
-class _Cut:
+class PowerCut:
     """A device whose power fails instead of its hearing one certain frame.
 
     Args:
@@ -91,7 +91,7 @@ def _meal(dut: Dut, when: Callable[[str, Values], bool] = lambda *_: False) -> L
     """A meal, and the power cut at a frame of it."""
     strategy = carbs_mode(dut)
     loop = dut.loop(strategy or "nma", [(MEAL, 60.0)], MEAL + 12)
-    loop.device = _Cut(dut, loop.device, when)
+    loop.device = PowerCut(dut, loop.device, when)
     return loop.play()
 
 
