@@ -123,7 +123,6 @@ class User(Group):
 class Diagnostics(Group):
     """DIA."""
 
-    lines: int = Field(gt=0)
     history: int = Field(gt=0)
 
 
