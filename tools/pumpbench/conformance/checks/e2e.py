@@ -115,7 +115,10 @@ Spoil = Callable[[Frame], Frame]
 
 
 def _expect_no_effect(dut: Dut, bad: Sequence[tuple[str, Spoil]], what: str) -> None:
-    """A run with bad frames ahead of the good ones, and one without: the same but for the error counts."""
+    """A run with bad frames ahead of the good ones, and one without: the same but for the error counts.
+
+    The filter of a CAN controller may keep remote frames and 29-bit identifiers away, so that nobody can count them.
+    """
     cyclic = {name: [spoil for victim, spoil in bad if victim == name] for name in CYCLIC}
     events = iter([each for each in bad if each[0] not in CYCLIC])
     apart = dut.settings.e2e.window + 1  # bad frames beside good ones must not add up to a message that is not valid
@@ -134,7 +137,11 @@ def _expect_no_effect(dut: Dut, bad: Sequence[tuple[str, Spoil]], what: str) -> 
         other = difference(_deeds(told), _deeds(turn))
         expect(not other, f"{what} to change nothing in step {k}; {other}")
         counted = turn.diag["E2eErrorCount"] - before
-        expect(counted == len(frames), f"E2eErrorCount to count {what} once each, {len(frames)} in step {k}; {counted}")
+        filtered = sum(frame.is_extended or frame.is_remote for frame in frames)
+        expect(
+            len(frames) - filtered <= counted <= len(frames),
+            f"E2eErrorCount to count {what} once each, {len(frames)} in step {k}; {counted} came",
+        )
         before = turn.diag["E2eErrorCount"]
 
 
