@@ -248,7 +248,7 @@ MAX_IOB: Final = 5
 """CfgIndex of CfgMaxIob."""
 
 
-@check("RST-03", needs=["restart", "boluses"])
+@check("RST-03", needs=["restart", "nvm", "boluses"])
 def boluses_after_a_restart(dut: Dut) -> None:
     """Meals after a restart, with status, totals or bolus states held back: no bolus before the last of them is there.
 
