@@ -588,7 +588,8 @@ class Firmware:
         inputs[layout.IN_OPEN] = self._boluses.remaining(Drug.INSULIN)
         inputs[layout.IN_INSULIN_LEFT] = self._insulin_left()
         inputs[layout.IN_PRAM_LEFT] = self._pram_left()
-        inputs[layout.IN_PRAM_STOP] = 1 if self._pump.pram_blocked or self._pump.insulin_blocked else 0
+        pump = self._pump
+        inputs[layout.IN_PRAM_STOP] = 1 if pump.pram_blocked or pump.insulin_blocked or pump.pram_unanswered else 0
         stop = 0 if self._may_bolus(Drug.INSULIN, state) else layout.STOP_INSULIN
         inputs[layout.IN_BOLUS_STOP] = stop | (0 if self._may_bolus(Drug.PRAMLINTIDE, state) else layout.STOP_PRAM)
         inputs[layout.IN_MEAL], inputs[layout.IN_CARBS] = self._meals.take()

@@ -104,6 +104,11 @@ class Pump:
         """Whether the pump does not run the set-point it was sent last."""
         return self._unlike >= UNLIKE_STEPS
 
+    @property
+    def pram_unanswered(self) -> bool:
+        """Whether the pump, which answers set-points, has not answered the last one for pramlintide (TWO-05)."""
+        return self._answers and ACK_PRAM_RATE in self._awaited
+
     def status(self, values: dict[str, int], step: int) -> None:
         """A PUMP_Status arrived for instant `step`."""
         shown = values["PumpLastBasalSeq"]
