@@ -6,7 +6,6 @@ from pumpbench.conformance.suite import select
 
 from firmware_sim import pump
 from firmware_sim.bolus import Boluses
-from firmware_sim.control import limits
 from firmware_sim.pump import Pump
 
 
@@ -30,9 +29,12 @@ def test_pramlintide_without_insulin() -> None:
     expect_failed("TWO-01", "no pramlintide without insulin", alone)
 
 
-def test_a_bolus_of_pramlintide_at_60(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "PRAM_LOWEST_GLUCOSE", -(1 << 30))
-    expect_failed("TWO-03", "no bolus of pramlintide below 70")
+def test_a_bolus_of_pramlintide_at_65() -> None:
+    def hears(name: str, values: Values) -> Values:
+        low = name == "CGM_Reading" and values["GlucoseConc"] < 700
+        return values | {"GlucoseConc": values["GlucoseConc"] + 300} if low else values
+
+    expect_failed("TWO-03", "no bolus of pramlintide below 70", Changed(hears))
 
 
 def test_a_ratio_that_is_off_by_two() -> None:
