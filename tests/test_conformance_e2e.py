@@ -9,26 +9,12 @@ from pumpbench.conformance.suite import select
 from can_bus import codec
 from can_bus.faults.fields import repaired
 from can_bus.frame import CAN_SFF_MASK, Frame
-from firmware_sim import ladder
+from firmware_sim import e2e_window, ladder
 from firmware_sim.cgm import Cgm
 from firmware_sim.firmware import Firmware
 
-PENDING = {
-    "E2E-03": "the firmware does not keep windows yet",
-    "E2E-07": "the firmware does not miss heartbeats yet",
-}
 
-
-@pytest.mark.parametrize(
-    "requirement",
-    [
-        pytest.param(
-            each.id,
-            marks=[pytest.mark.xfail(reason=PENDING[each.id], strict=True)] if each.id in PENDING else [],
-        )
-        for each in select(["E2E"])
-    ],
-)
+@pytest.mark.parametrize("requirement", [each.id for each in select(["E2E"])])
 def test_the_reference_passes(requirement: str) -> None:
     expect_passed(requirement)
 
@@ -98,8 +84,28 @@ def test_commands_whose_counter_nobody_looks_at() -> None:
     expect_failed("E2E-02", "a MODE_Cmd 4 ahead by its counter is not obeyed", Wired(in_order))
 
 
-def test_windows() -> None:
+def test_errors_that_no_window_sees() -> None:
     expect_failed("E2E-03", "good sample 1 after 2 wrong ones in a row is not used", Wired(without_errors))
+
+
+@pytest.mark.parametrize(
+    ("most", "text"),
+    [(0, "good sample 1 after 1 wrong ones in a row is used"), (2, "good sample 1 after 2 wrong ones in a row is not")],
+)
+def test_windows_for_more_or_fewer_errors(monkeypatch: pytest.MonkeyPatch, most: int, text: str) -> None:
+    monkeypatch.setattr(e2e_window, "ERRORS_AT_MOST", most)
+    expect_failed("E2E-03", text)
+
+
+def test_a_message_without_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    as_it_is = Firmware._boot
+
+    def boot(self: Firmware) -> None:
+        as_it_is(self)
+        self._windows["PUMP_Delivered"].close = lambda: True  # type: ignore[method-assign]
+
+    monkeypatch.setattr(Firmware, "_boot", boot)
+    expect_failed("E2E-03", "PUMP_Delivered with 3 U more, good frame 1 after 2 wrong ones in a row, is not used")
 
 
 def test_sixteen_lost_that_nobody_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,6 +170,18 @@ def test_malformed_frames_that_nobody_counts(monkeypatch: pytest.MonkeyPatch) ->
 def test_silence(monkeypatch: pytest.MonkeyPatch, limit: int, text: str) -> None:
     monkeypatch.setattr(ladder, "PUMP_SILENT", limit)
     expect_failed("E2E-07", text)
+
+
+@pytest.mark.parametrize("name", ["HB_PUMP", "HB_CGM"])
+def test_a_heartbeat_that_nobody_misses(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    as_it_is = Firmware._boot
+
+    def boot(self: Firmware) -> None:
+        as_it_is(self)
+        self._handlers[name] = lambda _: None
+
+    monkeypatch.setattr(Firmware, "_boot", boot)
+    expect_failed("E2E-07", f"another state than Auto 4 steps after the last {name}")
 
 
 def foreign(frame: Frame) -> Sequence[Frame]:

@@ -67,12 +67,12 @@ def tell(bench: Bench, *frames: Frame) -> Turn:
 def a_meal_acts_once(dut: Dut) -> None:
     """A meal that is told three times in every step for an hour, for its echo is lost: one bolus, and an echo.
 
-    Also over a restart, where the device can be restarted.
+    Also over a restart, where the device can be restarted and has a memory.
     """
     strategy = meal_mode(dut)
     if strategy is None:
         raise NotOffered("a mode with boluses for announced meals")
-    for restart in (False, True) if "restart" in dut.offers else (False,):
+    for restart in (False, True) if {"restart", "nvm"} <= dut.offers else (False,):
         loop = _nagged(dut, strategy, restart)
         doses = loop.commits(1)
         what = "with a restart between" if restart else "however often it is told"
