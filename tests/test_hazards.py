@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 from bench import S2, Bench, calibration
 from pumpbench.calibration import MODES
-from pumpbench.hazards import Monitor
+from pumpbench.hazards import CGM_LOST, Monitor
 
 import firmware_sim.ladder
 from can_bus import codec
@@ -268,7 +268,8 @@ def test_h7_a_lost_sensor_without_an_alarm() -> None:
 def test_h7_an_alarm_that_ends_too_early() -> None:
     alarm = codec.message("CTRL_Alarm")
     frames, _ = stale(10)
-    first = next(i for i, frame in enumerate(frames) if frame.can_id == alarm.can_id)
+    alarms = [i for i, frame in enumerate(frames) if frame.can_id == alarm.can_id]
+    first = next(i for i in alarms if alarm.unpack(frames[i].data)["CtrlAlarmCode"] == CGM_LOST)
     rest = [frame for frame in frames[first + 1 :] if frame.can_id != alarm.can_id]
     assert watched(frames[: first + 1] + rest) == none_but()  # it was raised, and never ended
     ended = [*frames[:first], changed(frames[first], CtrlAlarmState=0), *rest]
