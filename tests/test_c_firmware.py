@@ -1,6 +1,7 @@
 """The firmware in C: the doses, states and alarms of the reference firmware, and no crash whatever it hears."""
 
 import contextlib
+import json
 import random
 import re
 import shutil
@@ -513,6 +514,34 @@ def test_a_day_on_vcan(build: Path, pumpbench: Pumpbench, runs: Path, reference_
     need_vcan()
     found = run(pumpbench, "--bus", "socketcan:vcan0", out=runs / "c", program=build / "firmware")
     assert_same(found, reference_day)
+
+
+# ---- conformance
+
+
+def conformance(pumpbench: Pumpbench, program: Path, bus: str, *options: str) -> dict[str, str]:
+    """The verdicts that are neither "passed" nor about what this firmware does not offer."""
+    command = f"{program} {{bus}}"
+    done = pumpbench("conformance", "--bus", bus, "--firmware", command, "--json", "-", *options, timeout=400.0)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["offers"] == ["nma", "restart"]
+    verdicts = {each["id"]: each["verdict"] for each in told["requirements"]}
+    assert sum(verdict == "passed" for verdict in verdicts.values()) >= len(verdicts) * 2 // 3
+    return {name: verdict for name, verdict in verdicts.items() if verdict not in ("passed", "not applicable")}
+
+
+def test_it_conforms(build: Path, pumpbench: Pumpbench) -> None:
+    """Under sanitizers, which end it at the first mistake."""
+    left = conformance(pumpbench, build / "firmware_sanitize", "hub")
+    assert set(left.values()) <= {"tested elsewhere", "not checked"}
+
+
+@pytest.mark.vcan
+def test_it_conforms_on_vcan(build: Path, pumpbench: Pumpbench) -> None:
+    need_vcan()
+    left = conformance(pumpbench, build / "firmware", "socketcan:vcan0")
+    assert set(left.values()) <= {"tested elsewhere", "not checked"}
 
 
 @pytest.mark.parametrize(

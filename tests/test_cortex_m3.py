@@ -1,6 +1,7 @@
 """The C firmware cross-compiled for a Cortex-M3, on an emulated board that speaks slcan over its UART."""
 
 import contextlib
+import json
 import os
 import random
 import signal
@@ -190,6 +191,20 @@ def test_one_board_on_its_serial_port_does_one_run_after_the_other(
         ]
     folders.append(run(pumpbench, runs / "python", *short, "--bus", "inproc"))
     assert len({folder.info["trace_sha256"] for folder in folders}) == 1
+
+
+SHORT_SUITE = "SEN-01,SEN-03,SEN-04,E2E-01,E2E-02,E2E-07,CMD-08,LIM-01,FAL-01,FAL-02,FAL-04,ALM-03,TIM-01,TIM-04,NUM-02"
+
+
+def test_it_conforms(build: Path, pumpbench: Pumpbench) -> None:
+    """A device behind a serial adapter, as far as the bench can tell."""
+    with board(build / "fw.elf") as (url, _):
+        options = ["--bus", url, "--firmware", "none", "--only", SHORT_SUITE, "--modes", "nma", "--json", "-"]
+        done = pumpbench("conformance", *options, timeout=300.0)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)["requirements"]
+    assert {each["verdict"] for each in told} == {"passed"}
+    assert len(told) == len(SHORT_SUITE.split(","))
 
 
 # ---- a board that dies or babbles
