@@ -666,7 +666,7 @@ class Firmware:
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_REJECTED, step - self._last_rejected < ALARM_HOLD, step)
         alarms.hold(Code.PUMP_LOST, self._calibration.active and self._pump.age(step) >= PUMP_SILENT, step)
-        amiss = self._boluses.uncertain or self._pump.unlike or self._unbalanced()
+        amiss = self._boluses.uncertain or self._pump.unlike or self._pump.fallen or self._unbalanced()
         alarms.hold(Code.DELIVERY_UNCERTAIN, amiss, step)
         alarms.hold(Code.URGENT_LOW, self._urgent, step)
         alarms.hold(Code.CLOCK_JUMP, step - self._last_jump < ALARM_HOLD, step)

@@ -60,6 +60,8 @@ class Pump:
         self._unlike = 0  # steps in a row in which the pump showed another set-point than the last one
         self.insulin_blocked = False  # its line or its motor does not deliver
         self.pram_blocked = False
+        self._insulin_fell = False  # the newest total was below an older one, without a reset of the pump
+        self._pram_fell = False
         self.rate_limit = 8000  # raw, what the pump accepts as it last said
         self.pram_rate_limit = 8000
         self._boot_count: int | None = None
@@ -109,6 +111,11 @@ class Pump:
         """Whether the pump, which answers set-points, has not answered the last one for pramlintide (TWO-05)."""
         return self._answers and ACK_PRAM_RATE in self._awaited
 
+    @property
+    def fallen(self) -> bool:
+        """Whether the newest totals are not believed, because one fell without a reset of the pump."""
+        return self._insulin_fell or self._pram_fell
+
     def status(self, values: dict[str, int], step: int) -> None:
         """A PUMP_Status arrived for instant `step`."""
         shown = values["PumpLastBasalSeq"]
@@ -145,7 +152,8 @@ class Pump:
             return 0
         last, total = self._pram_total, totals["PramTotal"]
         rebooted = totals["PumpBootCount"] != self._boot_count
-        if last is not None and total < last and not rebooted:
+        self._pram_fell = last is not None and total < last and not rebooted
+        if self._pram_fell:
             return 0  # a total never falls without a reset of the pump
         self._pram_total = total
         if last is None:
@@ -180,11 +188,10 @@ class Pump:
         """Whether a total can be what it claims; one that is not counts as not received."""
         if totals["InsulinTotal"] >= TOTAL_MODULUS or totals["PumpBootCount"] >= BOOT_COUNT_SNA:
             return False
-        last = self._confirmed_total
-        if last is not None and totals["InsulinTotal"] < last and totals["PumpBootCount"] == self._boot_count:
-            self.refused += 1  # a total never falls without a reset of the pump
-            return False
-        return True
+        last, rebooted = self._confirmed_total, totals["PumpBootCount"] != self._boot_count
+        self._insulin_fell = last is not None and totals["InsulinTotal"] < last and not rebooted
+        self.refused += self._insulin_fell  # a total never falls without a reset of the pump
+        return not self._insulin_fell
 
     def _settle(self, total: int, boot_count: int, step: int) -> int:
         last = self._confirmed_total

@@ -222,3 +222,22 @@ def test_the_age_is_that_of_what_is_missed_longest() -> None:
     assert pump.age(12) == 2
     pump.bolus_state(1, 7)
     assert pump.age(12) == 5
+
+
+@pytest.mark.parametrize("drug", ["insulin", "pram"])
+def test_a_total_that_fell_without_a_reset_is_told_until_one_can_be_believed(drug: str) -> None:
+    """Requirement LED-03."""
+    pump = Pump()
+
+    def hear(insulin: int, pram: int, boots: int = 0) -> bool:
+        frame = totals(insulin, pram, boots=boots)
+        pump.pramlintide(frame)
+        pump.delivered(frame, 0, BASAL)
+        return pump.fallen
+
+    below = (99, 100) if drug == "insulin" else (100, 99)
+    assert not hear(100, 100)
+    assert hear(*below)
+    assert hear(*below)
+    assert not hear(100, 100)
+    assert not hear(*below, boots=1)

@@ -223,8 +223,11 @@ def test_a_limit_of_the_pump_holds_until_the_pump_takes_it_back() -> None:
     pump = bench.firmware._pump  # type: ignore[attr-defined]
 
     def ack(result: int, limit: int) -> list:
-        echo = {"AckFor": 1, "AckId": pump._sequence, "AckEchoRaw": 0}
-        return [bench.frame("PUMP_Ack", AckResult=result, AckLimitRaw=limit, **echo)]
+        asked = {"AckId": pump._sequence, "AckEchoRaw": pump._rates[1]}
+        return [
+            bench.frame("PUMP_Ack", AckFor=1, AckResult=result, AckLimitRaw=limit, **asked),
+            bench.frame("PUMP_Ack", AckFor=8, AckResult=0, AckLimitRaw=3000, **asked),
+        ]
 
     turn = bench.step(GLUCOSE + 450, also=ack(3, 0))
     assert (turn.rate, turn.command["PramlintideRate"]) == (0, 0)

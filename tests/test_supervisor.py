@@ -522,8 +522,11 @@ def test_a_blocked_line_stops_its_own_drug_and_insulins_stops_both(
 
 def answer(bench: Bench, turn: Turn, purpose: int, result: int, limit: int, back: int = 0) -> Turn:
     number = turn.command["BasalCmdSeq"] - back
-    ack = bench.frame("PUMP_Ack", AckFor=purpose, AckResult=result, AckId=number, AckEchoRaw=900, AckLimitRaw=limit)
-    return bench.step(HIGH + bench.k % 2, also=[ack])
+    acks = [bench.frame("PUMP_Ack", AckFor=purpose, AckResult=result, AckId=number, AckEchoRaw=900, AckLimitRaw=limit)]
+    if purpose == 1:  # the other drug's has come all the same
+        echo = turn.command["PramlintideRate"]
+        acks.append(bench.frame("PUMP_Ack", AckFor=8, AckResult=0, AckId=number, AckEchoRaw=echo, AckLimitRaw=3000))
+    return bench.step(HIGH + bench.k % 2, also=acks)
 
 
 def test_a_rate_over_the_pumps_limit_is_never_asked_for_again() -> None:
@@ -536,10 +539,23 @@ def test_a_rate_over_the_pumps_limit_is_never_asked_for_again() -> None:
     assert turn.command["PramlintideRate"] == pytest.approx(
         145, abs=1
     )  # the ratio of what is given, not of what is not
-    assert turn.diag["SequenceErrorCount"] == errors + 2  # the refusal, and no answer for the other drug
+    assert turn.diag["SequenceErrorCount"] == errors + 1
     assert all(bench.step(HIGH + 5 * k).rate == 290 for k in range(6))
     turn = answer(bench, bench.step(HIGH), 1, 3, 0)
     assert turn.rate == 0
+
+
+def test_pramlintide_whose_answer_is_missing_is_held_back_until_one_comes() -> None:
+    """Requirement TWO-05: what the pump made of it is not known; insulin goes on."""
+    bench = rising()
+    asked = answer(bench, bench.step(HIGH), 1, 0, 8000)
+    assert asked.command["PramlintideRate"] > 0
+    ack = bench.frame("PUMP_Ack", AckFor=1, AckResult=0, AckId=asked.command["BasalCmdSeq"], AckEchoRaw=asked.rate)
+    turn = bench.step(HIGH, also=[ack])
+    assert (turn.rate > 290, turn.command["PramlintideRate"]) == (True, 0)
+    assert turn.state == State.AUTO
+    assert not turn.status["LimiterBits"] & layout.LIMITER_MAX_BASAL
+    assert answer(bench, turn, 1, 0, 8000).command["PramlintideRate"] > 0
 
 
 def test_each_drugs_limit_is_its_own() -> None:

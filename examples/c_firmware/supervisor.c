@@ -287,12 +287,11 @@ static bool believable(struct pump *pump)
         totals->pump_boot_count >= PUMPBENCH_PUMP_DELIVERED_PUMP_BOOT_COUNT_SNA_CHOICE) {
         return false;
     }
-    if (pump->total >= 0 && (int32_t)totals->insulin_total < pump->total &&
-        totals->pump_boot_count == pump->boot_count) {
-        pump->refused++; /* a total never falls without a reset of the pump */
-        return false;
-    }
-    return true;
+    /* a total never falls without a reset of the pump */
+    pump->insulin_fell = pump->total >= 0 && (int32_t)totals->insulin_total < pump->total &&
+                         totals->pump_boot_count == pump->boot_count;
+    pump->refused += pump->insulin_fell ? 1u : 0u;
+    return !pump->insulin_fell;
 }
 
 /* Insulin delivered since the last step in mU, -1 while no total has ever come. What a missing total leaves open is
@@ -335,7 +334,8 @@ static int32_t pramlintide(struct pump *pump)
     }
     const int32_t last = pump->pram_total, total = (int32_t)totals->pram_total;
     const bool rebooted = totals->pump_boot_count != pump->boot_count;
-    if (last >= 0 && total < last && !rebooted) {
+    pump->pram_fell = last >= 0 && total < last && !rebooted;
+    if (pump->pram_fell) {
         return 0;
     }
     pump->pram_total = total;
@@ -707,7 +707,9 @@ static void report_alarms(struct supervisor *supervisor, int32_t step, const str
     const struct pump *pump = &supervisor->pump;
     const bool silent = calibration_active(calibration) && silence_of_pump(pump, step) >= PUMP_SILENT;
     alarms_hold(alarms, ALARM_PUMP_LOST, silent, step);
-    const bool amiss = pump->unlike >= UNLIKE_STEPS || is_off(pump->insulin_balance) || is_off(pump->pram_balance);
+    const bool fallen = pump->insulin_fell || pump->pram_fell;
+    const bool off = is_off(pump->insulin_balance) || is_off(pump->pram_balance);
+    const bool amiss = pump->unlike >= UNLIKE_STEPS || fallen || off;
     alarms_hold(alarms, ALARM_DELIVERY_UNCERTAIN, amiss, step);
     alarms_hold(alarms, ALARM_URGENT_LOW, supervisor->urgent, step);
     alarms_hold(alarms, ALARM_CLOCK_JUMP, step - supervisor->last_jump < ALARM_HOLD, step);

@@ -86,6 +86,7 @@ struct pump {
     bool balanced;                 /* the balances below held in the step before: no gap since */
     int64_t insulin_balance;       /* 1/12 mU that the totals grew more than was asked for */
     int64_t pram_balance;          /* 1/12 of 0.01 ug */
+    bool insulin_fell, pram_fell;  /* the newest total was below an older one, without a reset of the pump */
     uint32_t refused;              /* totals that fell without a reset, answers that were not Accepted */
     uint32_t unanswered;
 };
