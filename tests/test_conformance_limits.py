@@ -68,7 +68,7 @@ def test_a_limit_of_another_size(
 
 def test_insulin_on_board_that_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(core, "insulin_on_board", lambda *_: 0)
-    expect_failed("LIM-03", "more than 4 U on board")
+    expect_failed("LIM-03", "more than 3 U on board")
 
 
 # ---- LIM-04

@@ -114,14 +114,14 @@ def insulin_on_board(dut: Dut) -> None:
 
     In the first case at most the schedule while it is above, in the second it never gets there.
     """
-    bench = dut.bench(flash=calibration(CfgMaxIob=400))
+    bench = dut.bench(flash=calibration(CfgMaxIob=300))
     rate = rate_of(bench.run(12, HIGH), bench.schedule)
     expect(rate > bench.schedule, f"more than the schedule at {HIGH / 10:g} mg/dL before the limit; {rate} came")
-    bench.total += 12 * 8000  # the pump has given 8 U more
+    bench.total += 12 * 5000  # the pump has given 5 U more
     for _ in range(6):
         turn = bench.step(HIGH)
         rate, iob = rate_of(turn, bench.schedule), turn.status["InsulinOnBoard"]
-        expect(iob > 400, f"more than 4 U on board after 8 U; InsulinOnBoard {iob} came")
+        expect(iob > 300, f"more than 3 U on board after 5 U; InsulinOnBoard {iob} came")
         expect(rate <= bench.schedule, f"at most the schedule with InsulinOnBoard {iob} above its limit; {rate} came")
     if "boluses" not in dut.offers:
         return  # it gives none
