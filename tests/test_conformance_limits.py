@@ -83,12 +83,14 @@ def test_insulin_on_board_that_is_not_counted(monkeypatch: pytest.MonkeyPatch) -
     ],
 )
 def test_a_limit_that_is_loose_unless_set(monkeypatch: pytest.MonkeyPatch, name: str, raw: int, text: str) -> None:
+    monkeypatch.setattr(calibration, "NEEDED", ())  # the reference would not start
     monkeypatch.setitem(calibration.UNSET, name, raw)
     expect_failed("LIM-04", text)
 
 
 def test_a_limit_that_an_invalid_value_lifts(monkeypatch: pytest.MonkeyPatch) -> None:
     store = Calibration.store
+    monkeypatch.setattr(calibration, "NEEDED", ())  # the reference would not start
     monkeypatch.setitem(calibration.UNSET, "CfgMaxBasal", 0)  # so that it is put back afterwards
 
     def lifted(self: Calibration, values: Values) -> Values:
