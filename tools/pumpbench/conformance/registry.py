@@ -61,6 +61,16 @@ class Dut:
         loop.watch = log.extend
         return loop
 
+    def require(self, *needs: Need) -> None:
+        """Go on with what only some devices can be asked for; the rest of the check was for all.
+
+        Raises:
+            NotOffered: the device does not have all of these.
+        """
+        missing = [need for need in needs if need not in self.offers]
+        if missing:
+            raise NotOffered(", ".join(missing))
+
     def restart(self, memory: MemoryState = "kept") -> Sequence[Frame]:
         """Cut the device's power and give it back; what it says by itself. Only for checks that need `restart`."""
         return self._device.restart(memory)

@@ -32,7 +32,7 @@ from pumpbench.conformance.boluses import (
 )
 from pumpbench.conformance.driver import GLUCOSE, Op, State, alarm_code, expect
 from pumpbench.conformance.loop import Loop, Values
-from pumpbench.conformance.registry import MEALTIME, Dut, NotOffered, check
+from pumpbench.conformance.registry import MEALTIME, Dut, check
 
 EVERY: Final = 4
 """Steps between two meals, so that what became of one is settled before the next."""
@@ -195,8 +195,7 @@ def ids_and_retries(dut: Dut) -> None:
                 len(ids) == len(drugs),
                 f"one BolusId for each drug in step {step}, however often it is said; {ids} came",
             )
-    if "restart" not in dut.offers:
-        raise NotOffered("restart")
+    dut.require("restart", "nvm")
     for answer in range(1, 3):  # the one to Program, the one to Commit
         loop = dut.loop(meal_mode(dut), meals, steps=meals[-1][0] + EVERY)
         loop.device = PowerCut(dut, loop.device, _nth("PUMP_Ack", answer, lambda ack: ack["AckFor"] in ACK_OF.values()))

@@ -27,7 +27,7 @@ from pumpbench.conformance.boluses import (
 )
 from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, Op, Turn, calibration, expect
 from pumpbench.conformance.loop import Loop, Values
-from pumpbench.conformance.registry import MEALTIME, Dut, NotOffered, check
+from pumpbench.conformance.registry import MEALTIME, Dut, check
 
 ADULT: Final = "adult#001"
 
@@ -211,14 +211,13 @@ def _line(samples: Sequence[int], ahead: int) -> float:
 
 @check("LIM-06")
 def a_day(dut: Dut) -> None:
-    """Glucose swinging up to 400 mg/dL with a usual day of 3 U, and a reset on the way; then a ratio mode.
+    """Glucose swinging up to 400 mg/dL with a usual day of 3 U, also with a reset on the way; a ratio mode.
 
     The pump's totals stay within what 24 h may hold of each drug.
     """
     most = round(300 * dut.settings.limits.tdd_factor) * 10  # mU
-    bench = dut.bench(flash=calibration(ADULT, **tight(dut, CfgInsulinTdd=300)))
 
-    def run(steps: int) -> None:
+    def run(bench: Bench, steps: int) -> None:
         for _ in range(steps):
             bench.step(swing(bench.k))
             given = bench.total / 12
@@ -226,11 +225,9 @@ def a_day(dut: Dut) -> None:
                 given <= most + 10, f"at most {most} mU of insulin in 24 h; {given:.0f} were given by step {bench.k}"
             )
 
-    run(24)
+    raws = tight(dut, CfgInsulinTdd=300)
+    run(dut.bench(flash=calibration(ADULT, **raws)), 48)
     ratio = next((name for name in RATIO if name in dut.offers), None)
-    if "restart" in dut.offers:
-        bench.reboot(dut.restart())
-        run(24)
     if ratio is not None:
         day = dut.settings.limits.pramlintide_day
         fast = {"CfgPramTdd": day * 10, "CfgPramRatio": 4000, "CfgInsulinTdd": 16000, "CfgMaxBasal": 60000}
@@ -239,8 +236,11 @@ def a_day(dut: Dut) -> None:
             bench.step(swing(k))
             given = bench.pram_total / 1200
             expect(given <= day + 1, f"at most {day} ug of pramlintide in 24 h; {given:.0f} were given by step {k}")
-    if "restart" not in dut.offers:
-        raise NotOffered("restart")
+    dut.require("restart", "nvm")
+    bench = dut.bench(flash=calibration(ADULT, **raws))
+    run(bench, 24)
+    bench.reboot(dut.restart())
+    run(bench, 24)
 
 
 @check("LIM-07", needs=["boluses"])
