@@ -30,7 +30,7 @@ coverage: setup  ## lines and branches of the firmware that no test runs: none m
 nightly: setup   ## the long tests: hostile sequences, random frames, oracle and compiled loop, matrix, hunt and kills in full
 	PUMPBENCH_NIGHTLY=1 PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 PUMPBENCH_KILLS=1000 \
 	  $(BIN)/python -m pytest --timeout 5400 -n logical --dist loadfile tests/test_hostile.py tests/test_float_oracle.py \
-	  tests/test_compiled_loop.py tests/test_catalogue.py tests/test_hunt.py tests/test_kills.py
+	  tests/test_compiled_loop.py tests/test_catalogue.py tests/test_hunt.py tests/test_kills.py tests/test_conformance_variants.py
 
 mutation: setup  ## mutation score of the dosing, limits, protocol and memory modules (about an hour)
 	$(BIN)/mutmut run
