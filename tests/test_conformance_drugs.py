@@ -5,7 +5,9 @@ from conformance_devices import Change, Changed, Values, expect_failed, expect_p
 from pumpbench.conformance.suite import select
 
 from firmware_sim import pump
-from firmware_sim.bolus import Boluses
+from firmware_sim.bolus import ACKS, Boluses, Op
+from firmware_sim.ladder import Ladder, State
+from firmware_sim.meals import Meals
 from firmware_sim.pump import Pump
 
 
@@ -29,6 +31,11 @@ def test_pramlintide_without_insulin() -> None:
     expect_failed("TWO-01", "no pramlintide without insulin", alone)
 
 
+def test_pramlintide_for_a_meal_without_a_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ladder, "_next_rung", lambda *_: State.AUTO)
+    expect_failed("TWO-01", "no bolus of pramlintide while the sensor is lost in mode s3")
+
+
 def test_a_bolus_of_pramlintide_at_65() -> None:
     def hears(name: str, values: Values) -> Values:
         low = name == "CGM_Reading" and values["GlucoseConc"] < 700
@@ -49,7 +56,44 @@ def test_boluses_of_pramlintide_in_a_mode_without() -> None:
     def says(name: str, values: Values) -> Values:
         return values | {"CtrlMode": 4} if name == "CTRL_Status" and values["CtrlMode"] == 7 else values
 
-    expect_failed("TWO-03", "at most 0 boluses of pramlintide for a meal in mode sma", Changed(hears, says))
+    expect_failed("TWO-03", "at most 0 boluses of pramlintide for 3 meals in mode sma", Changed(hears, says))
+
+
+def test_a_meal_that_is_dosed_as_often_as_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    hear = Meals.hear
+
+    def anew(self: Meals, values: Values) -> None:
+        self.last = None
+        hear(self, values)
+
+    monkeypatch.setattr(Meals, "hear", anew)
+    expect_failed("TWO-03", "at most 3 boluses of pramlintide for 3 meals in mode s3")
+
+
+def test_sugar_that_is_dosed_like_a_meal() -> None:
+    def hears(name: str, values: Values) -> Values:
+        kinds = {3: 4, 4: 3}  # instead of the snack
+        return (
+            values | {"MealKind": kinds.get(values["MealKind"], values["MealKind"])}
+            if name == "MEAL_Announce"
+            else values
+        )
+
+    expect_failed("TWO-03", "one bolus of pramlintide at most after each meal told", Changed(hears))
+
+
+def test_a_meal_that_gets_nothing_because_one_drug_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    listen = Boluses.listen
+
+    def both(self: Boluses) -> None:
+        refused = self.refused
+        listen(self)
+        for each in self._open.values():
+            each.op = Op.CANCEL if self.refused > refused else each.op
+
+    monkeypatch.setattr(Boluses, "listen", both)
+    monkeypatch.setattr(Pump, "pram_blocked", property(lambda _: False, lambda *_: None), raising=False)
+    expect_failed("TWO-04", "in mode s3; (0, 0) were committed with pramlintide stopped")
 
 
 def test_a_blocked_line_of_pramlintide_that_stops_insulin(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,3 +143,13 @@ def test_an_answer_for_pramlintide_that_is_missing_stops_it_until_one_comes() ->
     assert not device.pram_unanswered
     command()
     assert device.pram_unanswered
+
+
+def test_an_answer_for_the_other_drug_that_is_taken_for_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hear(self: Boluses, values: Values) -> None:
+        for each in self._open.values():
+            if values["AckId"] == each.number and values["AckFor"] in ACKS:
+                each.ack = (values["AckResult"], values["AckEchoRaw"])
+
+    monkeypatch.setattr(Boluses, "hear_ack", hear)
+    expect_failed("TWO-06", "no Commit of a bolus that the pump took for the other drug's")

@@ -1,16 +1,18 @@
 """Two drugs (TWO): pramlintide goes with insulin, never instead of it, and neither is mistaken for the other."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import dbc
 from can_bus import codec
+from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 from plant_server.physiology import load_patient
 from pumpbench.calibration import MODES, SAFE, calibrate
 from pumpbench.conformance.boluses import (
     COMMIT,
     DOSE,
+    DRUGS,
     INSULIN,
     PRAMLINTIDE,
     PROGRAM_ACKS,
@@ -19,8 +21,8 @@ from pumpbench.conformance.boluses import (
     programs,
 )
 from pumpbench.conformance.driver import GLUCOSE, Bench, Op, State, Turn, calibration, expect
-from pumpbench.conformance.loop import Loop, Values
-from pumpbench.conformance.registry import Dut, Need, check
+from pumpbench.conformance.loop import Loop, Values, Wire
+from pumpbench.conformance.registry import Dut, Need, NotOffered, check
 
 HIGH: Final = GLUCOSE + 800
 """A glucose that calls for insulin above the schedule, 0.1 mg/dL."""
@@ -39,13 +41,25 @@ PRAM_RATE_ACK: Final = 8
 FIRST: Final = 6
 """Step of the first meal: the device is in Auto by then."""
 
+MEALS: Final = tuple(
+    codec.choice("MEAL_Announce", "MealKind", kind) for kind in ("CarbsEstimated", "SimpleMeal", "Snack")
+)
+NO_MEALS: Final = tuple(codec.choice("MEAL_Announce", "MealKind", kind) for kind in ("HypoTreatment", "Cancel"))
+
 STEPS_TO_NOTICE: Final = 3
 """Within so many steps a missing answer for pramlintide has to stop it."""
 
 
 def ratio_mode(dut: Dut) -> str:
-    """A mode of this device in which pramlintide follows insulin."""
-    return next(name for name in RATIO_MODES if name in dut.offers)
+    """A mode of this device in which pramlintide follows insulin.
+
+    Raises:
+        NotOffered: it has none.
+    """
+    for name in RATIO_MODES:
+        if name in dut.offers:
+            return name
+    raise NotOffered("a mode in which pramlintide follows insulin")
 
 
 def pramlintide(turn: Turn) -> int:
@@ -63,7 +77,7 @@ def giving(dut: Dut, **how: object) -> Bench:
 
 @check("TWO-01", needs=["pramlintide"])
 def never_alone(dut: Dut) -> None:
-    """Glucose down to 60, a suspension by the user, a sensor that is lost: without insulin no pramlintide either."""
+    """Glucose down to 60, a suspension by the user, a sensor that is lost: no pramlintide, not for a meal either."""
     safe = calibrate(load_patient("adult#001"), SAFE)
     mode = next((name for name in RATIO_MODES if name in dut.offers), None)
     if mode is not None:
@@ -80,12 +94,18 @@ def never_alone(dut: Dut) -> None:
         lost = [bench.step(drop=True) for _ in range(dut.settings.ladder.safe + 1)]
         for turn in (*falling, *suspended, *lost):
             _expect_together(turn)
+    late = FIRST + dut.settings.ladder.safe
     for mode in (name for name in BOLUS_MODES if name in dut.offers):
-        loop = dut.loop(mode, [(FIRST, 60.0)], steps=FIRST + 3)
-        loop.to_device = _sensor_says(loop, 600)
-        loop.play()
-        asked = programs(loop, PRAMLINTIDE)
-        expect(not asked, f"no bolus of pramlintide while glucose is 60 mg/dL in mode {mode}; {asked} came")
+        for why, meal, wire in (
+            ("glucose is 60 mg/dL", FIRST, _sensor_says(600)),
+            ("the sensor is lost", late, _sensor_lost),
+            ("the user suspends", late, _user_suspends),
+        ):
+            loop = dut.loop(mode, [(meal, 60.0)], steps=meal + 3)
+            loop.to_device = wire(loop)
+            loop.play()
+            asked = programs(loop, PRAMLINTIDE)
+            expect(not asked, f"no bolus of pramlintide while {why} in mode {mode}; {len(asked)} came")
 
 
 def _expect_together(turn: Turn) -> None:
@@ -98,14 +118,36 @@ def _expect_together(turn: Turn) -> None:
     expect(insulin or PRAMLINTIDE not in drugs, "no bolus of pramlintide while insulin is suspended")
 
 
-def _sensor_says(loop: Loop, glucose: int) -> Forged:
+def _sensor_says(glucose: int) -> Callable[[Loop], Wire]:
     """A wire on which the sensor's value is another one from the step before the meal on."""
 
-    def change(_name: str, values: Values) -> Sequence[Values]:
-        late = loop.plant.step >= FIRST - 1
-        return [values | {"GlucoseConc": glucose + loop.plant.step} if late else values]
+    def wire(loop: Loop) -> Wire:
+        def change(_name: str, values: Values) -> Sequence[Values]:
+            late = loop.plant.step >= FIRST - 1
+            return [values | {"GlucoseConc": glucose + loop.plant.step} if late else values]
 
-    return Forged(change, "CGM_Reading")
+        return Forged(change, "CGM_Reading")
+
+    return wire
+
+
+def _sensor_lost(loop: Loop) -> Wire:
+    """A wire on which no sample arrives from the step of the first meal on."""
+    return Forged(lambda _name, values: [] if loop.plant.step >= FIRST else [values], "CGM_Reading")
+
+
+def _user_suspends(loop: Loop) -> Wire:
+    """A wire on which the user suspends in the step of the first meal."""
+    user = Transmitter()
+    user.frame("MODE_Cmd")  # the plant has sent one with the calibration
+
+    def wire(name: str, _values: Values, frame: Frame) -> Sequence[Frame] | None:
+        if name != "SYNC_Step" or loop.plant.step != FIRST:
+            return None
+        request = {"ModeRequest": loop.plant.run.mode, "ModeCmdSeq": 1, "SuspendRequest": 1}
+        return [user.frame("MODE_Cmd", **request), frame]
+
+    return wire
 
 
 @check("TWO-02", needs=["pramlintide"])
@@ -140,29 +182,58 @@ def _index(name: str) -> int:
 
 @check("TWO-03", needs=["pramlintide"])
 def boluses_of_pramlintide(dut: Dut) -> None:
-    """A meal in every mode: boluses of pramlintide in s1, s3 and s4 alone, one for a meal, none at 65 mg/dL."""
+    """Announcements of every kind, each one twice, in every mode: boluses of pramlintide in s1, s3 and s4 alone.
+
+    There is at most one for each meal, none for sugar or a Cancel, and none at 65 mg/dL.
+    """
+    meals = {FIRST + 4 * k: kind for k, kind in enumerate(MEALS + NO_MEALS)}
     for mode in (name for name in MODES if name in dut.offers):
-        loop = dut.loop(mode, [(FIRST, 60.0)], steps=FIRST + 14)
+        loop = dut.loop(mode, steps=max(meals) + 3)
+        loop.to_device = _announced(loop, meals)
         loop.play()
         asked = programs(loop, PRAMLINTIDE)
-        most = 1 if mode in BOLUS_MODES else 0
+        if mode == "s1":
+            continue  # boluses at the peaks of its infusion, which no meal asks for
+        most = len(MEALS) if mode in BOLUS_MODES else 0
         expect(
-            len(asked) <= most, f"at most {most} boluses of pramlintide for a meal in mode {mode}; {len(asked)} came"
+            len(asked) <= most,
+            f"at most {most} boluses of pramlintide for {len(MEALS)} meals in mode {mode}; {len(asked)} came",
+        )
+        told = [max((step for step in meals if step <= each.step), default=-1) for each in asked]
+        expect(
+            len(set(told)) == len(told) and all(meals.get(step) in MEALS for step in told),
+            f"one bolus of pramlintide at most after each meal told, MealKind {meals}, in mode {mode}; they came after "
+            f"those of steps {told}",
         )
         expect(mode != "s3" or bool(asked), "a bolus of pramlintide for an announced meal in mode s3; none came")
     low = dut.settings.drugs.pramlintide_low * 10
     if "s3" in dut.offers:
         loop = dut.loop("s3", [(FIRST, 60.0)], steps=FIRST + 3)
-        loop.to_device = _sensor_says(loop, low - 50)
+        loop.to_device = _sensor_says(low - 50)(loop)
         loop.play()
         expect(not programs(loop, PRAMLINTIDE), f"no bolus of pramlintide below {low / 10:g} mg/dL")
 
 
+def _announced(loop: Loop, meals: Mapping[int, int]) -> Wire:
+    """A wire on which the user tells of meals of 10 g, step -> MealKind, in two steps each."""
+    user, first = Transmitter(), min(meals)
+
+    def wire(name: str, _values: Values, frame: Frame) -> Sequence[Frame] | None:
+        step = loop.plant.step
+        kind = meals.get(step, meals.get(step - 1))
+        if name != "SYNC_Step" or kind is None:
+            return None
+        meal = {"MealKind": kind, "MealId": (step - first) // 2, "MealOffset": 0, "CarbsEst": 20}
+        return [user.frame("MEAL_Announce", **meal), frame]
+
+    return wire
+
+
 @check("TWO-04", needs=["pramlintide"])
 def faults_of_one_side(dut: Dut) -> None:
-    """Each side's line blocked and its reservoir empty: insulin goes on alone, pramlintide never does."""
+    """Each side's line blocked and its reservoir empty, also at a meal: insulin goes on alone, the other not."""
     bad = (("PramOcclusion", OCCLUDED), ("PramReservoir", 0), ("InsulinOcclusion", OCCLUDED), ("InsulinReservoir", 0))
-    for name, value in bad:
+    for name, value in bad if any(mode in dut.offers for mode in RATIO_MODES) else ():
         bench = giving(dut)
         turns = [bench.step(HIGH, status=False, also=[_pump_status(bench, **{name: value})]) for _ in range(3)]
         for turn in turns[1:]:
@@ -171,6 +242,18 @@ def faults_of_one_side(dut: Dut) -> None:
                 expect(rate > 0, f"insulin goes on with {name}={value}; {turn.command} came")
             else:
                 expect(pramlintide(turn) == 0, f"no pramlintide with {name}={value}; {pramlintide(turn)} came")
+
+    for mode in (name for name in ("s3", "s4") if name in dut.offers):
+        for drug in (INSULIN, PRAMLINTIDE):
+            loop = dut.loop(mode, [(FIRST, 40.0)], steps=FIRST + 3)
+            loop.plant.pump.boluses[drug].chamber.stopped = True
+            loop.play()
+            given = len(loop.commits(INSULIN)), len(loop.commits(PRAMLINTIDE))
+            expect(
+                given == ((0, 0) if drug == INSULIN else (1, 0)),
+                f"insulin alone for a meal while the pump gives no pramlintide, and nothing without insulin, in mode "
+                f"{mode}; {given} were committed with {DRUGS[drug]} stopped",
+            )
 
 
 def _pump_status(bench: Bench, **fields: int) -> Frame:
@@ -201,10 +284,13 @@ def answers_apart(dut: Dut) -> None:
 
 @check("TWO-06", needs=["boluses", "pramlintide"])
 def the_other_scale(dut: Dut) -> None:
-    """The pump's echo of a bolus in the other drug's scale, ten times the number or a tenth: Cancel and no Commit."""
+    """The pump's echo of a bolus is ten times the number or a tenth; then the command itself becomes the other drug's.
+
+    No Commit follows, and not a stroke of either drug.
+    """
     mode = next((name for name in ("s3", "s4") if name in dut.offers), None)
     if mode is None:
-        return
+        raise NotOffered("a mode with boluses of both drugs")
     for drug, factor in ((INSULIN, 10), (INSULIN, 0.1), (PRAMLINTIDE, 10), (PRAMLINTIDE, 0.1)):
         loop = dut.loop(mode, [(FIRST, 60.0)], steps=FIRST + 3)
         stage = next(ack for ack, of in PROGRAM_ACKS.items() if of == drug)
@@ -219,3 +305,20 @@ def the_other_scale(dut: Dut) -> None:
         committed = [each for each in commands(loop, drug=drug) if each.op == COMMIT]
         text = f"no Commit of a bolus in {DOSE[drug]} whose echo is {factor:g} times its dose; {len(committed)} came"
         expect(not committed, text)
+
+    loop = dut.loop(mode, [(FIRST, 60.0)], steps=FIRST + 4)
+    loop.to_plant = Forged(_of_the_other_drug, "PUMP_BolusCmd")
+    loop.play()
+    committed = commands(loop, COMMIT)
+    expect(not committed, f"no Commit of a bolus that the pump took for the other drug's; {len(committed)} came")
+    given = [loop.bolus_strokes(drug) for drug in (INSULIN, PRAMLINTIDE)]
+    expect(given == [0, 0], f"no stroke of a bolus that the pump took for the other drug's; {given} were made")
+
+
+def _of_the_other_drug(_name: str, values: Values) -> Sequence[Values]:
+    drug = values["BolusHormone"]
+    other = {INSULIN: PRAMLINTIDE, PRAMLINTIDE: INSULIN}[drug]
+    return [
+        {name: raw for name, raw in values.items() if name != DOSE[drug]}
+        | {"BolusHormone": other, DOSE[other]: values[DOSE[drug]]}
+    ]
