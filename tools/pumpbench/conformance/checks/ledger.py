@@ -174,10 +174,10 @@ def totals_that_fall(dut: Dut) -> None:
     if "boluses" not in dut.offers:
         return  # it gives none
 
-    whole = _slow_bolus(dut, FIRST + 7)
+    whole = _slow_bolus(dut, FIRST + 5)
     flash(whole, CfgMaxBolus=2 * MADE_IN_A_STEP)
     wanted = _levels_after(whole, FIRST + 2)
-    found = _levels_after(_slow_bolus(dut, FIRST + 7, at=FIRST + 2, event=Pump.reset), FIRST + 2)
+    found = _levels_after(_slow_bolus(dut, FIRST + 5, at=FIRST + 2, event=Pump.reset), FIRST + 2)
     expect_alike(found, wanted, f"a reset of the pump that had made {2 * MADE_IN_A_STEP} of a bolus")
 
 
@@ -191,10 +191,10 @@ def _pending(bench: Bench) -> set[int]:
 def broken_off(dut: Dut) -> None:
     """A bolus broken off when 0.5 U and 1.5 U of it are made (long: 1 U as well), its acknowledgements lost or not.
 
-    From then on InsulinOnBoard is that of a bolus of just what was made, which went well.
+    In the two steps after it InsulinOnBoard is that of a bolus of just what was made, which went well.
     """
     for steps in (1, 2, 3) if dut.long else (1, 3):
-        whole = _slow_bolus(dut, FIRST + steps + 5)
+        whole = _slow_bolus(dut, FIRST + steps + 3)
         made = steps * MADE_IN_A_STEP
         flash(whole, CfgMaxBolus=made)
         wanted = _levels_after(whole, FIRST + steps)
@@ -203,7 +203,7 @@ def broken_off(dut: Dut) -> None:
             f"InsulinOnBoard of about {made} (0.01 U) after a bolus of it; {wanted[0]} came",
         )
         for lost in (False, True):
-            loop = _slow_bolus(dut, FIRST + steps + 5, at=FIRST + steps, lost=lost)
+            loop = _slow_bolus(dut, FIRST + steps + 3, at=FIRST + steps, lost=lost)
             found = _levels_after(loop, FIRST + steps)
             (asked,) = programs(loop, INSULIN)
             expect(
