@@ -59,7 +59,7 @@ class Watched(PlantServer):
         self.acks: Acks = set()
         self.row: dict[str, int] = {}
 
-    def heard(self, name: str, values: dict[str, int]) -> None:
+    def note(self, name: str, values: dict[str, int]) -> None:
         """A frame of either side."""
         if name == "CGM_Reading":
             self.row |= {"cgm": values["GlucoseConc"], "cgm_state": values["CgmState"]}
@@ -112,7 +112,7 @@ def on_the_bus(case: Case) -> tuple[Result, Acks]:
         answers = list(firmware.receive(frame))
         for each in (frame, *answers):
             if each.can_id in watched:
-                plant.heard(watched[each.can_id].name, watched[each.can_id].unpack(each.data))
+                plant.note(watched[each.can_id].name, watched[each.can_id].unpack(each.data))
         for answer in answers:
             to_device += plant.receive(answer)
     floats = np.array(plant.floats).T
