@@ -21,7 +21,7 @@ from can_bus.codec import Transmitter, message, protect
 from can_bus.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, Frame, pack, unpack
 from can_bus.lockstep import Phase
 from firmware_sim.calibration import LOWEST, NEEDED, SET_CRC_INDEX, UNSET, set_crc
-from firmware_sim.firmware import Firmware, own_messages, subscriptions
+from firmware_sim.firmware import CYCLIC, Firmware, own_messages, subscriptions
 from firmware_sim.ladder import State
 
 SOURCE = ROOT / "examples" / "c_firmware"
@@ -233,6 +233,35 @@ def forged(name: str, step: int, generator: random.Random) -> Frame:
 def test_a_disturbed_day_ends_as_with_the_reference(build: Path, seed: int) -> None:
     heard = disturbed(vector()[0], seed)
     found = answers(build / "firmware_sanitize", pack(heard), ENDED, BUS_LOST)
+    assert comparable(found) == comparable(of_reference(heard))
+
+
+def in_bursts(heard: Sequence[Frame], seed: int) -> list[Frame]:
+    """The day with bursts of damaged, lost, repeated and good frames of the messages that come in every step."""
+    generator = random.Random(seed)
+    ids = {message(name).can_id: heard[0] for name in CYCLIC}  # and the last good frame of each
+    bursts = dict.fromkeys(ids, 0)
+    result: list[Frame] = []
+    for place, frame in enumerate(heard):
+        if frame.can_id not in ids or place < 50:
+            result.append(frame)
+            continue
+        bursts[frame.can_id] = max(bursts[frame.can_id] - 1, 0) or generator.choice((0, 0, 0, 4, 9))
+        fate = generator.choice("gggcccr-") if bursts[frame.can_id] else "g"
+        if fate == "r":
+            result.append(ids[frame.can_id])
+        elif fate == "c":
+            result.append(Frame(frame.can_id, bytes([frame.data[0] ^ 1, *frame.data[1:]])))
+        elif fate == "g":
+            result.append(frame)
+            ids[frame.can_id] = frame
+    return result
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_bursts_of_errors_end_as_with_the_reference(build: Path, seed: int) -> None:
+    heard = in_bursts(vector()[0], seed)
+    found = answers(build / "firmware_sanitize", pack(heard))
     assert comparable(found) == comparable(of_reference(heard))
 
 
