@@ -27,9 +27,6 @@ SETTLING_SAMPLES = 3
 JUMP = 500
 """0.1 mg/dL in one step: a rise above this is believed only when the next sample agrees (requirement SEN-06)."""
 
-HEARTBEATS_MISSED = 3
-"""Steps without HB_CGM, once it was heard, after which the sensor counts as silent (660 s; requirement E2E-07)."""
-
 NOISE_HIGH = 30
 """CgmNoise in 0.5 mg/dL above which insulin stays at or below the schedule (requirement SEN-09)."""
 
@@ -70,15 +67,6 @@ class Cgm:
         self._unconfirmed = -1  # a rise that waits for the next sample to agree
         self._equal = 0  # samples in a row with the value of the one before
         self._value_last = -1
-        self._alive: int | None = None  # step of the newest HB_CGM; a sensor that never sent one is not missed by it
-
-    def heartbeat(self, step: int) -> None:
-        """HB_CGM came for instant `step`."""
-        self._alive = step
-
-    def silent(self, step: int) -> bool:
-        """Whether the sensor's heartbeat has stopped."""
-        return self._alive is not None and step - self._alive >= HEARTBEATS_MISSED
 
     @property
     def waiting(self) -> bool:

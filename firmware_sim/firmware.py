@@ -27,6 +27,7 @@ from .control.fixed import Ints, round_divide
 from .control.layout import MODE_OFF, MODE_S4
 from .day import Day
 from .e2e_window import E2eWindow
+from .heartbeat import TIMEOUT, Heartbeat
 from .isotp import IsoTp
 from .ladder import AGE_DEGRADED, PUMP_SILENT, Ladder, State
 from .meals import Meals
@@ -151,8 +152,8 @@ class Firmware:
             "PUMP_BolusState": self._on_bolus_state,
             "CGM_Status": self._on_cgm_status,
             "MEAL_Announce": self._on_meal_announce,
-            "HB_PUMP": lambda _values: self._heartbeats.add("HB_PUMP"),
-            "HB_CGM": lambda _values: self._heartbeats.add("HB_CGM"),
+            "HB_PUMP": lambda values: self._pump_heartbeat.hear(values["TogglePump"]),
+            "HB_CGM": lambda values: self._cgm_heartbeat.hear(values["ToggleCgm"]),
         }
         self._boot()
         record = None if self._nvm is None else self._nvm.load()
@@ -166,6 +167,8 @@ class Firmware:
         self._transmitter = Transmitter()
         self._receiver = Receiver(name for name in subscriptions() if name != DIAGNOSTICS)
         self._windows = {name: E2eWindow() for name in CYCLIC}
+        self._pump_heartbeat = Heartbeat()
+        self._cgm_heartbeat = Heartbeat()
         self._isotp = IsoTp()
         self._uds = Uds(self)
         self._turn = Turn(self._transmitter)
@@ -191,7 +194,6 @@ class Firmware:
         self._totals_known = False  # in the step before
         self._short_seen = dict.fromkeys(Drug, 0)
         self._status: dict[str, int] | None = None
-        self._heartbeats: set[str] = set()  # heard since the last step
         self._bolus_states: set[int] = set()  # drugs heard of in this step
         self._rejected = False
         self._scheduler = Scheduler(self._tasks())
@@ -416,11 +418,8 @@ class Firmware:
             self._impostors_seen = self._impostors
             self._last_impostor = self._now
         self._drop_invalid()
-        if "HB_CGM" in self._heartbeats:
-            self._cgm.heartbeat(self._now)
-        if "HB_PUMP" in self._heartbeats:
-            self._pump.heartbeat(self._now)
-        self._heartbeats.clear()
+        self._pump_heartbeat.close(self._now)
+        self._cgm_heartbeat.close(self._now)
         return frames
 
     def _drop_invalid(self) -> None:
@@ -457,9 +456,10 @@ class Firmware:
         self._ladder.update(
             calibrated=self._calibration.active,
             suspended=self._suspended or self._mode == MODE_OFF,
-            age=max(self._cgm.age(step), AGE_DEGRADED if self._cgm.silent(step) else 0),
+            age=self._cgm.age(step),
             streak=self._cgm.streak,
-            pump_age=self._pump.age(step),
+            pump_age=self._pump_age(step),
+            sensor_silent=self._sensor_silent(step),
             uncertain=self._boluses.uncertain,
             held=self._held,
             fault=bool(self._failures & STOPS) or self._scheduler.bitten,
@@ -482,6 +482,14 @@ class Firmware:
     @property
     def _now(self) -> int:
         return -1 if self._step is None else self._step
+
+    def _pump_age(self, step: int) -> int:
+        """Steps since all that the pump says in every step was heard."""
+        return max(self._pump.age(step), self._pump_heartbeat.silence(step))
+
+    def _sensor_silent(self, step: int) -> bool:
+        """Whether the sensor's heartbeats have ceased."""
+        return self._cgm_heartbeat.silence(step) >= TIMEOUT
 
     def _stale_age(self) -> int:
         """CfgStaleCgmLimit as the age of a sample, in steps; it can only tighten (requirement USR-05)."""
@@ -657,7 +665,8 @@ class Firmware:
         if state != self._reported_state and not CHANGES_OF_THEIR_OWN.isdisjoint((state, self._reported_state)):
             self._last_change = step
         down = self._ladder.rung != State.AUTO
-        lost = age >= AGE_DEGRADED or (down and (alarms.active(Code.CGM_LOST) or state == self._ladder.rung))
+        silent = age >= AGE_DEGRADED or self._sensor_silent(step)
+        lost = silent or (down and (alarms.active(Code.CGM_LOST) or state == self._ladder.rung))
         # without a calibration nothing is dosed, but a sensor that was heard and falls silent is told of all the same
         listening = self._calibration.active or self._cgm.sequence is not None
         alarms.hold(Code.CGM_LOST, lost and listening, min(age, 0xFFFF))
@@ -665,7 +674,7 @@ class Firmware:
         alarms.hold(Code.E2E_FAULT, step - self._last_e2e_error < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_LIMITED, step - self._last_limited < ALARM_HOLD, step)
         alarms.hold(Code.DOSE_REJECTED, step - self._last_rejected < ALARM_HOLD, step)
-        alarms.hold(Code.PUMP_LOST, self._calibration.active and self._pump.age(step) >= PUMP_SILENT, step)
+        alarms.hold(Code.PUMP_LOST, self._calibration.active and self._pump_age(step) >= PUMP_SILENT, step)
         amiss = self._boluses.uncertain or self._pump.unlike or self._pump.fallen or self._unbalanced()
         alarms.hold(Code.DELIVERY_UNCERTAIN, amiss, step)
         alarms.hold(Code.URGENT_LOW, self._urgent, step)

@@ -52,6 +52,7 @@ class Ladder:
         pump_age: int,
         uncertain: bool = False,
         held: bool = False,
+        sensor_silent: bool = False,
         fault: bool = False,
         age_degraded: int = AGE_DEGRADED,
     ) -> State:
@@ -62,13 +63,15 @@ class Ladder:
             suspended: the user has suspended delivery.
             age: steps since the newest usable CGM sample was taken.
             streak: steps in a row with a usable sample, this one included.
-            pump_age: steps since the pump's status and totals were both heard.
+            pump_age: steps since all that the pump says in every step was heard.
             uncertain: a bolus may or may not have been delivered.
             held: nothing but the schedule until the user resumes (too many resets).
+            sensor_silent: the sensor's heartbeats have ceased: at most the schedule, however good its samples look.
             fault: the device has found a fault in itself: nothing is commanded, until it restarts.
             age_degraded: age from which on at most the schedule is given; can only be tightened.
         """
-        self._rung = State.SAFE_BASAL if held else self._next_rung(age, streak, min(age_degraded, AGE_DEGRADED))
+        best = State.DEGRADED if sensor_silent or age >= min(age_degraded, AGE_DEGRADED) else State.AUTO
+        self._rung = State.SAFE_BASAL if held else self._next_rung(age, streak, best)
         if fault:
             self.state = State.FAULT
         elif not calibrated:
@@ -82,8 +85,8 @@ class Ladder:
         elif self.state == State.INIT and streak < SAMPLES_UP and age < AGE_SAFE_BASAL:
             self.state = State.INIT
         elif self.state == State.INIT and streak >= SAMPLES_UP:
-            self._rung = State.AUTO  # the first samples of a run are not a way back up
-            self.state = State.AUTO
+            self._rung = best  # the first samples of a run are not a way back up
+            self.state = best
         else:
             self.state = self._rung
         return self.state
@@ -93,12 +96,11 @@ class Ladder:
         if self.state in (State.AUTO, State.DEGRADED, State.SAFE_BASAL):
             self.state = State.DELIVERY_UNCERTAIN
 
-    def _next_rung(self, age: int, streak: int, age_degraded: int) -> State:
+    def _next_rung(self, age: int, streak: int, best: State) -> State:
         if age >= AGE_SAFE_BASAL:
             return State.SAFE_BASAL
-        floor = State.DEGRADED if age >= age_degraded else State.AUTO
-        if floor >= self._rung:
-            return floor
+        if best >= self._rung:
+            return best
         if streak >= SAMPLES_UP:
             return State(self._rung - 1)
         return self._rung

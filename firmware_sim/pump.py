@@ -70,7 +70,6 @@ class Pump:
         self._status_step = -NEVER
         self._totals_step = -NEVER
         self._bolus_steps: dict[int, int] = {}  # drug -> step of its newest PUMP_BolusState
-        self._alive: int | None = None  # step of the newest HB_PUMP
         self._answers = False  # the pump is one that acknowledges set-points
         self._awaited: set[int] = set()  # AckFor of what the last set-point has not been answered with
         self._rates: tuple[int, int] | None = None  # raw, of the last set-point
@@ -88,13 +87,8 @@ class Pump:
         return insulin, 0 if self._rates is None else self._rates[1] * 10
 
     def age(self, step: int) -> int:
-        """Steps since status, totals, heartbeat and states of boluses were last heard; of these, those ever heard."""
-        alive = step if self._alive is None else self._alive
-        return step - min(self._status_step, self._totals_step, alive, *self._bolus_steps.values())
-
-    def heartbeat(self, step: int) -> None:
-        """HB_PUMP came for instant `step` (requirement E2E-07)."""
-        self._alive = step
+        """Steps since status, totals and the states of boluses were last heard; of these, those ever heard."""
+        return step - min(self._status_step, self._totals_step, *self._bolus_steps.values())
 
     @property
     def heard(self) -> bool:

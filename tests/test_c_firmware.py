@@ -239,7 +239,7 @@ def test_a_disturbed_day_ends_as_with_the_reference(build: Path, seed: int) -> N
 def in_bursts(heard: Sequence[Frame], seed: int) -> list[Frame]:
     """The day with bursts of damaged, lost, repeated and good frames of the messages that come in every step."""
     generator = random.Random(seed)
-    ids = {message(name).can_id: heard[0] for name in CYCLIC}  # and the last good frame of each
+    ids = {message(name).can_id: heard[0] for name in (*CYCLIC, "HB_PUMP", "HB_CGM")}  # and the newest frame
     bursts = dict.fromkeys(ids, 0)
     result: list[Frame] = []
     for place, frame in enumerate(heard):

@@ -69,7 +69,6 @@ static void note(struct firmware *firmware, unsigned index, enum verdict verdict
     }
 }
 
-
 /* Whether a frame may be read, and which message it is; what it may not is counted and has no other effect. */
 static bool check(struct firmware *firmware, const struct frame *frame, unsigned *index)
 {
@@ -323,12 +322,16 @@ bool firmware_receive(struct firmware *firmware, const struct frame *in, struct 
         }
         return true;
     }
-    case MESSAGE_HB_CGM:
-        supervisor_hear_heartbeat_cgm(supervisor);
+    case MESSAGE_HB_CGM: {
+        UNPACK(hb_cgm, in);
+        supervisor_hear_cgm_heartbeat(supervisor, &values);
         return true;
-    case MESSAGE_HB_PUMP:
-        supervisor_hear_heartbeat_pump(supervisor);
+    }
+    case MESSAGE_HB_PUMP: {
+        UNPACK(hb_pump, in);
+        supervisor_hear_pump_heartbeat(supervisor, &values);
         return true;
+    }
     default: /* the pump's alarms are checked and counted; meals mean nothing to mode nma */
         return true;
     }

@@ -12,6 +12,49 @@ static bool has_bit(uint32_t bits, unsigned bit)
     return (bits >> bit & 1u) != 0u;
 }
 
+/* ---- heartbeats (requirement E2E-07) */
+
+#define HEARTBEAT_TIMEOUT 3 /* steps since the last one after which a node is silent: more than 660 s */
+
+static void hear_heartbeat(struct heartbeat *heartbeat, int32_t toggle)
+{
+    heartbeat->came = true;
+    heartbeat->moved = heartbeat->moved || toggle != heartbeat->toggle;
+    heartbeat->toggle = toggle;
+}
+
+void supervisor_hear_pump_heartbeat(struct supervisor *supervisor, const struct pumpbench_hb_pump_t *heartbeat)
+{
+    hear_heartbeat(&supervisor->pump.heartbeat, heartbeat->toggle_pump);
+}
+
+void supervisor_hear_cgm_heartbeat(struct supervisor *supervisor, const struct pumpbench_hb_cgm_t *heartbeat)
+{
+    hear_heartbeat(&supervisor->sensor.heartbeat, heartbeat->toggle_cgm);
+}
+
+static void close_heartbeat(struct heartbeat *heartbeat, int32_t step)
+{
+    if (heartbeat->came) { /* after a step without one the bit proves nothing: a single lost one costs one step */
+        const bool alive = heartbeat->moved || step - heartbeat->came_step > 1;
+        heartbeat->alive_step = alive ? step : heartbeat->alive_step;
+        heartbeat->came_step = step;
+    }
+    heartbeat->came = heartbeat->moved = false;
+}
+
+static void forget_heartbeat(struct heartbeat *heartbeat)
+{
+    heartbeat->toggle = -1;
+    heartbeat->came_step = heartbeat->alive_step = NEVER;
+}
+
+/* Whether the sensor's heartbeats have ceased; of a sensor that has never sent one they are not missed. */
+static bool is_silent(const struct sensor *sensor, int32_t step)
+{
+    return sensor->heartbeat.alive_step != NEVER && step - sensor->heartbeat.alive_step >= HEARTBEAT_TIMEOUT;
+}
+
 /* ---- sensor (requirements SEN-01 to SEN-09) */
 
 #define CGM_STATE(name) PUMPBENCH_CGM_READING_CGM_STATE_##name##_CHOICE
@@ -26,7 +69,6 @@ static bool has_bit(uint32_t bits, unsigned bit)
 #define SETTLING_SAMPLES 3u       /* in a row after a gap before trends are trusted again */
 #define JUMP 500                  /* 0.1 mg/dL in a step: a rise above waits for the next sample; a fall never waits */
 #define NOISE_HIGH 30u            /* CgmNoise, 0.5 mg/dL */
-#define HEARTBEATS_MISSED 3       /* steps without HB_CGM, once it was heard, after which the sensor is silent */
 #define FAULT_BITS (1u | 2u | 8u) /* noise, compression low, calibration error */
 
 void supervisor_hear_reading(struct supervisor *supervisor, const struct pumpbench_cgm_reading_t *reading)
@@ -42,17 +84,6 @@ void supervisor_skip_reading(struct supervisor *supervisor)
 {
     /* after a gap it is a sample, unused but not lost; beside a usable sample it is a copy */
     supervisor->sensor.skipped++;
-}
-
-void supervisor_hear_heartbeat_cgm(struct supervisor *supervisor)
-{
-    supervisor->sensor.alive_came = true;
-}
-
-/* Whether the sensor's heartbeat has stopped (requirement E2E-07). */
-static bool is_silent(const struct sensor *sensor, int32_t step)
-{
-    return sensor->alive != NEVER && step - sensor->alive >= HEARTBEATS_MISSED;
 }
 
 void supervisor_hear_cgm_status(struct supervisor *supervisor, const struct pumpbench_cgm_status_t *status)
@@ -247,17 +278,12 @@ bool supervisor_hear_ack(struct supervisor *supervisor, const struct pumpbench_p
     return !accepted || !pump->rates_sent || ack->ack_echo_raw == asked;
 }
 
-void supervisor_hear_heartbeat_pump(struct supervisor *supervisor)
-{
-    supervisor->pump.alive_came = true;
-}
-
 /* Steps since status, totals, heartbeat and the states of boluses were last heard; of the latter two, those ever heard. */
 static int32_t silence_of_pump(const struct pump *pump, int32_t step)
 {
     int32_t heard = pump->status_step < pump->totals_step ? pump->status_step : pump->totals_step;
-    if (pump->alive != NEVER && pump->alive < heard) {
-        heard = pump->alive;
+    if (pump->heartbeat.alive_step != NEVER && pump->heartbeat.alive_step < heard) {
+        heard = pump->heartbeat.alive_step;
     }
     for (unsigned drug = 0u; drug < HORMONES; drug++) {
         if (has_bit(pump->bolus_states_heard, drug) && pump->bolus_step[drug] < heard) {
@@ -418,14 +444,13 @@ static int32_t insulin_left(const struct supervisor *supervisor, const struct ca
 #define PUMP_SILENT 3    /* steps without the pump after which delivery is uncertain */
 #define BITES_AFTER 3u   /* overruns in a row after which the watchdog bites */
 
-static enum ladder_state next_rung(enum ladder_state rung, int32_t age, uint32_t streak, int32_t age_degraded)
+static enum ladder_state next_rung(enum ladder_state rung, int32_t age, uint32_t streak, enum ladder_state best)
 {
     if (age >= AGE_SAFE_BASAL) {
         return LADDER_SAFE_BASAL;
     }
-    const enum ladder_state floor = age >= age_degraded ? LADDER_DEGRADED : LADDER_AUTO;
-    if (floor >= rung) {
-        return floor;
+    if (best >= rung) {
+        return best;
     }
     if (streak < SAMPLES_UP) {
         return rung;
@@ -435,14 +460,13 @@ static enum ladder_state next_rung(enum ladder_state rung, int32_t age, uint32_t
 
 static void climb(struct supervisor *supervisor, int32_t step, const struct calibration *calibration)
 {
-    int32_t age = age_of_sample(&supervisor->sensor, step);
-    if (is_silent(&supervisor->sensor, step) && age < AGE_DEGRADED) {
-        age = AGE_DEGRADED;
-    }
+    const int32_t age = age_of_sample(&supervisor->sensor, step);
     const uint32_t streak = supervisor->sensor.streak;
     /* CfgStaleCgmLimit as an age in steps; it can only tighten (requirement USR-05) */
     const int32_t stale = calibration->supervision.stale_cgm_limit / 5 + 1;
-    supervisor->rung = next_rung(supervisor->rung, age, streak, stale < AGE_DEGRADED ? stale : AGE_DEGRADED);
+    const bool doubted = age >= (stale < AGE_DEGRADED ? stale : AGE_DEGRADED) || is_silent(&supervisor->sensor, step);
+    const enum ladder_state best = doubted ? LADDER_DEGRADED : LADDER_AUTO;
+    supervisor->rung = next_rung(supervisor->rung, age, streak, best);
     if (supervisor->parameters_damaged || supervisor->overruns_in_a_row >= BITES_AFTER) {
         supervisor->state = LADDER_FAULT;
     } else if (!calibration_active(calibration)) {
@@ -454,8 +478,8 @@ static void climb(struct supervisor *supervisor, int32_t step, const struct cali
     } else if (supervisor->state == LADDER_INIT && streak < SAMPLES_UP && age < AGE_SAFE_BASAL) {
         supervisor->state = LADDER_INIT;
     } else if (supervisor->state == LADDER_INIT && streak >= SAMPLES_UP) {
-        supervisor->rung = LADDER_AUTO; /* the first samples of a run are not a way back up */
-        supervisor->state = LADDER_AUTO;
+        supervisor->rung = best; /* the first samples of a run are not a way back up */
+        supervisor->state = best;
     } else {
         supervisor->state = supervisor->rung;
     }
@@ -696,7 +720,8 @@ static void report_alarms(struct supervisor *supervisor, int32_t step, const str
         supervisor->last_change = step;
     }
     const bool down = supervisor->rung != LADDER_AUTO;
-    const bool lost = age >= AGE_DEGRADED || (down && (alarms_active(alarms, ALARM_CGM_LOST) || state == supervisor->rung));
+    const bool absent = age >= AGE_DEGRADED || is_silent(&supervisor->sensor, step);
+    const bool lost = absent || (down && (alarms_active(alarms, ALARM_CGM_LOST) || state == supervisor->rung));
     /* without a calibration nothing is dosed, but a sensor that was heard and falls silent is told of all the same */
     const bool listening = calibration_active(calibration) || supervisor->sensor.sequence != NEVER;
     alarms_hold(alarms, ALARM_CGM_LOST, lost && listening, age < 0xFFFF ? age : 0xFFFF);
@@ -759,17 +784,6 @@ static void report_status(const struct supervisor *supervisor, const struct link
     report->diag.saturation_count = at_most(supervisor->control.saturations, 1023u);
 }
 
-static void take_heartbeats(struct supervisor *supervisor, int32_t step)
-{
-    if (supervisor->sensor.alive_came) {
-        supervisor->sensor.alive = step;
-    }
-    if (supervisor->pump.alive_came) {
-        supervisor->pump.alive = step;
-    }
-    supervisor->sensor.alive_came = supervisor->pump.alive_came = false;
-}
-
 /* Work is counted, not timed, so that it is the same on every machine; more than a budget is an overrun. */
 static void count_work(struct supervisor *supervisor, uint32_t frames, uint32_t samples)
 {
@@ -781,7 +795,8 @@ void supervisor_step(struct supervisor *supervisor, int32_t step, uint32_t sim_t
                      const struct calibration *calibration, const struct link_counts *counts, struct report *report)
 {
     drop_invalid(supervisor);
-    take_heartbeats(supervisor, step);
+    close_heartbeat(&supervisor->pump.heartbeat, step);
+    close_heartbeat(&supervisor->sensor.heartbeat, step);
     const int32_t skipped = supervisor->step < 0 ? 0 : step - supervisor->step - 1;
     const uint32_t samples = supervisor->sensor.heard;
     supervisor->step = step;
@@ -818,11 +833,13 @@ void supervisor_boot(struct supervisor *supervisor)
 {
     memset(supervisor, 0, sizeof *supervisor);
     struct sensor *sensor = &supervisor->sensor;
-    sensor->sequence = sensor->taken = sensor->alive = NEVER;
+    sensor->sequence = sensor->taken = NEVER;
+    forget_heartbeat(&sensor->heartbeat);
     sensor->last = sensor->unconfirmed = sensor->value_last = -1;
     sensor->session = PUMPBENCH_CGM_STATUS_CGM_SESSION_ID_SNA_CHOICE;
     struct pump *pump = &supervisor->pump;
-    pump->status_step = pump->totals_step = pump->alive = NEVER;
+    pump->status_step = pump->totals_step = NEVER;
+    forget_heartbeat(&pump->heartbeat);
     pump->sequence = SEQUENCES_BASAL - 1;
     pump->commanded = SCHEDULE;
     pump->rate_limit = RATE_MAX;

@@ -40,6 +40,14 @@ struct window {
     uint8_t good, bad;                       /* a bit per check, the newest lowest */
 };
 
+/* Whether a node is alive: it says so once per step, with a bit that toggles (requirement E2E-07). */
+struct heartbeat {
+    bool came, moved;   /* since the last step */
+    int32_t toggle;     /* of the newest one, -1 before the first */
+    int32_t came_step;  /* when it came, NEVER before the first */
+    int32_t alive_step; /* when one last counted, NEVER before the first: then none is missed */
+};
+
 /* The CGM as the firmware sees it. */
 struct sensor {
     struct pumpbench_cgm_reading_t samples[SAMPLES_MAX]; /* of this step, checked by E2E */
@@ -57,8 +65,7 @@ struct sensor {
     uint32_t unused;        /* frames since the newest usable sample that came and could not be used */
     uint32_t streak;        /* steps in a row with a usable sample */
     uint32_t since_gap;     /* usable samples since the last long gap */
-    bool alive_came;        /* a heartbeat, in this step */
-    int32_t alive;          /* step of the newest one, NEVER before the first: then none is missed */
+    struct heartbeat heartbeat;
 };
 
 /* The pump as the firmware sees it. */
@@ -69,8 +76,7 @@ struct pump {
     uint16_t bolus_states_came;    /* in this step, a bit per drug */
     int32_t status_step, totals_step, bolus_step[HORMONES]; /* when they were last heard, NEVER before the first */
     uint16_t bolus_states_heard;   /* ever, a bit per drug */
-    bool alive_came;               /* a heartbeat, in this step */
-    int32_t alive;                 /* step of the newest one, NEVER before the first: then none is missed */
+    struct heartbeat heartbeat;
     bool blocked;                  /* the insulin line or its motor does not deliver */
     uint32_t unlike;               /* steps in a row in which the pump showed another set-point than the last one */
     int32_t sequence;              /* BasalCmdSeq of the last set-point */
@@ -154,8 +160,8 @@ void supervisor_boot(struct supervisor *supervisor);
 void supervisor_hear_reading(struct supervisor *supervisor, const struct pumpbench_cgm_reading_t *reading);
 void supervisor_skip_reading(struct supervisor *supervisor); /* one that E2E does not allow to read */
 void supervisor_note(struct supervisor *supervisor, enum cyclic message, enum verdict verdict);
-void supervisor_hear_heartbeat_cgm(struct supervisor *supervisor);
-void supervisor_hear_heartbeat_pump(struct supervisor *supervisor);
+void supervisor_hear_pump_heartbeat(struct supervisor *supervisor, const struct pumpbench_hb_pump_t *heartbeat);
+void supervisor_hear_cgm_heartbeat(struct supervisor *supervisor, const struct pumpbench_hb_cgm_t *heartbeat);
 void supervisor_hear_cgm_status(struct supervisor *supervisor, const struct pumpbench_cgm_status_t *status);
 void supervisor_hear_pump_status(struct supervisor *supervisor, const struct pumpbench_pump_status_t *status);
 void supervisor_hear_delivered(struct supervisor *supervisor, const struct pumpbench_pump_delivered_t *totals);
