@@ -20,8 +20,8 @@ from can_bus.process import exit_status
 from can_bus.url import open_link
 
 from .console import Console, FirmwareView
-from .firmware import NVM_WORDS, Cause, Firmware, own_messages, subscriptions
-from .nvm import FileMemory, NvmError, memory_size
+from .firmware import NVM_BYTES, Cause, Firmware, own_messages, subscriptions
+from .nvm import FileMemory, NvmError
 from .serial_port import PortError, SerialPort
 
 POLL_SECONDS = 0.05
@@ -37,7 +37,7 @@ def memory(path: Path) -> FileMemory:
         NvmError: the file is no such memory.
         OSError: it cannot be opened.
     """
-    return FileMemory(str(path), memory_size(NVM_WORDS), opener=lambda name, flags: os.open(name, flags, 0o600))
+    return FileMemory(str(path), NVM_BYTES, opener=lambda name, flags: os.open(name, flags, 0o600))
 
 
 def attend(port: SerialPort, console: Console, over: threading.Event) -> None:

@@ -93,6 +93,11 @@ class Alarms:
         """Whether this alarm is in force, confirmed or not."""
         return code in self._active
 
+    @property
+    def bits(self) -> int:
+        """Those in force, confirmed or not: a bit per code."""
+        return sum(1 << code for code in self._active)
+
     def hold(self, code: Code, cause: bool, aux: int) -> None:
         """Raise the alarm if its cause holds, end it if not; `aux` (16 bit) tells more and may change.
 

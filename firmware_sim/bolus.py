@@ -92,6 +92,7 @@ class Boluses:
         self.next_id = 0
         self.refused = 0  # boluses the pump refused or understood wrongly, so far
         self.short = dict.fromkeys(Drug, 0)  # raw, of boluses that ended before they were whole, so far
+        self.committed = dict.fromkeys(Drug, 0)  # raw, of boluses whose first Commit was sent in this step
         self.unanswered = 0  # commands that no acknowledgement came for, so far
         self.limit = {Drug.INSULIN: 4000, Drug.PRAMLINTIDE: 4000}  # what the pump accepts, as it last said
         self._open: dict[Drug, _Bolus] = {}
@@ -151,6 +152,7 @@ class Boluses:
             What newly turns out to be delivered of each drug, raw.
         """
         delivered: list[tuple[Drug, int]] = []
+        self.committed = dict.fromkeys(Drug, 0)
         for drug in list(self._open):
             bolus, state = self._open[drug], self._states.get(drug)
             bolus.sends = 0
@@ -203,7 +205,9 @@ class Boluses:
             if bolus.op == Op.NONE or self._must_wait(drug, bolus):
                 continue
             bolus.sends += 1
-            bolus.committed |= bolus.op == Op.COMMIT
+            if bolus.op == Op.COMMIT and not bolus.committed:
+                bolus.committed = True
+                self.committed[drug] = bolus.dose
             said = True
             turn.send(
                 "PUMP_BolusCmd",

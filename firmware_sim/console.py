@@ -5,8 +5,12 @@ A reply is one line of key=value pairs (or several for a list), then `OK` or `ER
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol
+
+from .alarms import Code
+from .history import STEPS, Record
+from .ladder import State
 
 LINE_MAX = 128
 """Characters of a line; a longer one is refused as a whole."""
@@ -30,8 +34,12 @@ HELP = (
     ("echo on|off", "echo and prompt; off is the mode for machines"),
     ("version", "of the firmware and of the protocol"),
     ("faults", "alarms in force, highest first"),
+    ("history [N]", "the last N steps, the newest last: doses, state, limits, alarms, resets; 12 if no N is given"),
     ("reset", "restart from the non-volatile memory after this turn"),
 )
+
+HISTORY_STEPS = 12
+"""An hour, where nobody says how many."""
 
 Pairs = Mapping[str, int | str]
 
@@ -47,6 +55,9 @@ class Device(Protocol):
 
     def faults(self) -> Iterable[Pairs]:
         """Alarms in force."""
+
+    def history(self) -> Sequence[Record]:
+        """The last 24 h, the oldest step first."""
 
     def version(self) -> Pairs:
         """Of firmware and protocol."""
@@ -81,7 +92,7 @@ class FirmwareView:
         """Copy what the device says now; only ever called by the thread that runs the device."""
         status = dict(self._device.status())
         faults = tuple(dict(fault) for fault in self._device.faults())
-        self._snapshot = status, dict(self._device.parameters()), faults
+        self._snapshot = status, dict(self._device.parameters()), faults, tuple(self._device.history())
         seen = {fault["code"]: fault["state"] for fault in faults}
         if seen != self._seen:
             seconds = int(status["time"])
@@ -104,6 +115,10 @@ class FirmwareView:
         """Alarms in force after that step."""
         return self._snapshot[2]
 
+    def history(self) -> Sequence[Record]:
+        """The last 24 h up to that step, the oldest first."""
+        return self._snapshot[3]
+
     def version(self) -> Pairs:
         """Of firmware and protocol."""
         return self._version
@@ -123,6 +138,13 @@ class _Refused(Exception):
 def pairs(values: Pairs) -> str:
     """One line of key=value pairs."""
     return " ".join(f"{key}={value}" for key, value in values.items())
+
+
+def history_line(record: Record) -> str:
+    """One step as key=value pairs, with the names of state and alarms."""
+    names = ",".join(code.name.lower() for code in Code if record.alarms >> code & 1)
+    values: dict[str, int | str] = {**record._asdict(), "state": State(record.state).name.lower()}
+    return pairs(values | {"alarms": names or "none"})
 
 
 class Console:
@@ -154,6 +176,7 @@ class Console:
             "echo": self._set_echo,
             "version": self._version,
             "faults": self._faults,
+            "history": self._history,
             "reset": self._reset,
         }
 
@@ -276,6 +299,12 @@ class Console:
     def _faults(self, rest: str) -> list[str]:
         self._nothing(rest, "faults")
         return [pairs(fault) for fault in self._device.faults()]
+
+    def _history(self, rest: str) -> list[str]:
+        steps = int(rest) if rest.isdecimal() else HISTORY_STEPS if not rest else 0
+        if not 0 < steps <= STEPS:
+            raise _Refused(ERR_USAGE, f"usage: history [N], N from 1 to {STEPS}")
+        return [history_line(record) for record in self._device.history()[-steps:]]
 
     def _reset(self, rest: str) -> list[str]:
         self._nothing(rest, "reset")

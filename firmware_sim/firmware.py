@@ -28,10 +28,11 @@ from .control.layout import MODE_OFF, MODE_S4
 from .day import Day
 from .e2e_window import E2eWindow
 from .heartbeat import TIMEOUT, Heartbeat
+from .history import AREA, History, Record, pack
 from .isotp import IsoTp
 from .ladder import AGE_DEGRADED, PUMP_SILENT, Ladder, State
 from .meals import Meals
-from .nvm import Memory, Nvm
+from .nvm import Memory, Nvm, NvmError, memory_size
 from .pump import Op, Pump
 from .scheduler import Scheduler, Task
 from .selftest import Failure, check_program, check_ram
@@ -54,6 +55,9 @@ STOPS = Failure.PROGRAM | Failure.RAM | Failure.PARAMETERS
 
 NVM_WORDS = 320
 """Room for everything that survives a reset."""
+
+NVM_BYTES = memory_size(NVM_WORDS) + AREA
+"""Of the whole memory: two banks, and the history behind them."""
 
 COMMANDING = (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN)
 """States in which the control law commands rates; in the others its limits cut nothing."""
@@ -129,13 +133,19 @@ class Firmware:
     Args:
         memory: non-volatile; what it holds of an earlier life is taken up, until a roll call begins a new run.
         cause: why the device starts.
+
+    Raises:
+        NvmError: the memory has less than `NVM_BYTES` bytes.
     """
 
     def __init__(self, memory: Memory | None = None, cause: Cause = Cause.POWER_ON) -> None:
         self.finished = False
         self.reset_requested = False
         self.log: Callable[[str, int, str, str], None] = lambda _level, _seconds, _module, _text: None
+        if memory is not None and memory.size < NVM_BYTES:
+            raise NvmError(f"a memory of {memory.size} bytes, but the firmware needs {NVM_BYTES} bytes")
         self._nvm = None if memory is None else Nvm(memory, NVM_WORDS)
+        self._history = History(memory, memory_size(NVM_WORDS))
         self._cause = cause
         self._uds_request = message(DIAGNOSTICS).can_id
         self._uds_response = message("UDS_Response").can_id
@@ -200,6 +210,7 @@ class Firmware:
         self._frames_heard = 0
         self._work = 0  # counted in this step
         self._glucose, self._delivered, self._bolus, self._skipped = -1, -1, 0, 0  # found by the tasks of this step
+        self._pram_delivered = 0
         self._failures = check_program() | check_ram(self._state, self._inputs, self._outputs)
         self._turn_open = False  # the step waits for the pump's answers
         self._refused_seen = 0
@@ -350,6 +361,7 @@ class Firmware:
             self._report_alarms(self._ladder.state, step)
             self._report_status(self._ladder.state)
         self._store()
+        self._history.write(self._record(step))
         if self._turn_open:
             return self._turn.close(step, Done.CONTINUE)
         return self._turn.close(step, Done.OVERRUN if self._scheduler.late else Done.OK, self._work)
@@ -363,6 +375,7 @@ class Firmware:
     def _answer_roll_call(self, call: int) -> list[Frame]:
         understood = self._judge_peer()
         self._boot()
+        self._history.clear()
         major, minor = dbc.protocol_version()
         self._send_heartbeat(NMT_BOOT_UP)
         self._turn.send(
@@ -551,6 +564,7 @@ class Firmware:
         told = self._boluses.open_step(step)
         bolus, pram_bolus = (sum(raw * 10 for drug, raw in told if drug == wanted) for wanted in Drug)
         delivered = self._pump.delivered(self._totals, step, basal, bolus)
+        self._pram_delivered = pramlintide
         # of a bolus that ended too early all that was asked for is held against the pump
         asked, pram_asked = bolus + self._newly_short(Drug.INSULIN), pram_bolus + self._newly_short(Drug.PRAMLINTIDE)
         self._balance(basal, {Drug.INSULIN: (asked, delivered), Drug.PRAMLINTIDE: (pram_asked, pramlintide)})
@@ -700,8 +714,8 @@ class Firmware:
             "CTRL_Status",
             CtrlMode=self._mode,
             CtrlState=state,
-            InsulinOnBoard=min(self._outputs[layout.OUT_IOB] + self._boluses.remaining(Drug.INSULIN), IOB_MAX),
-            LimiterBits=self._outputs[layout.OUT_LIMITERS] if state in COMMANDING else 0,
+            InsulinOnBoard=self._insulin_on_board(),
+            LimiterBits=self._limiters(state),
             **({} if used is None else {"LastCgmSeq": used}),
             **({} if self._meals.last is None else {"LastMealId": self._meals.last}),
         )
@@ -714,6 +728,12 @@ class Firmware:
             NvmFallbackCount=min(self._fallbacks(), 255),
         )
         self._send_heartbeat(NMT_OPERATIONAL if self._calibration.active else NMT_PRE_OPERATIONAL)
+
+    def _insulin_on_board(self) -> int:
+        return min(self._outputs[layout.OUT_IOB] + self._boluses.remaining(Drug.INSULIN), IOB_MAX)
+
+    def _limiters(self, state: State) -> int:
+        return self._outputs[layout.OUT_LIMITERS] if state in COMMANDING else 0
 
     def _all_sequence_errors(self) -> int:
         by_number = self._pump.refused + self._meals.repeated
@@ -734,10 +754,13 @@ class Firmware:
             "HB_CTRL",
             NmtCtrl=nmt,
             ToggleCtrl=self._toggle,
-            ResetCauseCtrl=self._cause if self._reset_here else Cause.POWER_ON,
+            ResetCauseCtrl=self._told_cause(),
             BootCtrl=self._boots % 32,
         )
         self._toggle ^= 1
+
+    def _told_cause(self) -> Cause:
+        return self._cause if self._reset_here else Cause.POWER_ON
 
     # ---- non-volatile memory
 
@@ -745,6 +768,29 @@ class Firmware:
         """Keep what must survive a reset; called before the frames of the turn leave."""
         if self._nvm is not None:
             self._nvm.store(self._save())
+
+    def _record(self, step: int) -> Record:
+        """What the history keeps of this step; of a turn that is not the last one, what is known by then."""
+        state = self._ladder.state
+        op, rate, pram_rate = self._pump.set_point if self._pump.set_point_step == step else (0, 0, 0)
+        return Record(
+            step=step,
+            boots=self._boots,
+            cause=self._told_cause(),
+            state=state,
+            mode=self._mode,
+            op=op,
+            glucose=self._glucose,
+            iob=self._insulin_on_board(),
+            rate=rate,
+            pram_rate=pram_rate,
+            bolus=self._boluses.committed[Drug.INSULIN],
+            pram_bolus=self._boluses.committed[Drug.PRAMLINTIDE],
+            delivered=self._delivered,
+            pram_delivered=self._pram_delivered,
+            limiters=self._limiters(state),
+            alarms=self._alarms.bits,
+        )
 
     def _save(self) -> list[int]:
         resets = self._boot_steps + [-1] * (RESETS_KEPT - len(self._boot_steps))
@@ -823,6 +869,10 @@ class Firmware:
         """Alarms in force, highest priority first."""
         return self._alarms.listing()
 
+    def history(self) -> Sequence[Record]:
+        """The last 24 h, the oldest step first."""
+        return self._history.records()
+
     def version(self) -> dict[str, int | str]:
         """Of this firmware, and of the protocol it speaks."""
         major, minor = dbc.protocol_version()
@@ -838,6 +888,7 @@ class Firmware:
     def identification(self) -> dict[int, bytes]:
         """Data by identifier: docs/diagnostics.md has the table."""
         major, minor = dbc.protocol_version()
+        records = self._history.records()
         counters = (
             self._e2e_errors(),
             self._lost_frames(),
@@ -856,8 +907,14 @@ class Firmware:
             0x0101: dbc.crc32().to_bytes(4, "big"),
             0x0102: bytes([self._ladder.state, self._mode]),
             0x0103: (STEP_SNA if self._step is None else self._step).to_bytes(4, "big"),
+            0x0120: len(records).to_bytes(2, "big"),
             **{0x0110 + i: min(count, 0xFFFF).to_bytes(2, "big") for i, count in enumerate(counters)},
         }
+
+    def history_at(self, place: int) -> bytes:
+        """The packed record in a place of the ring; empty where there is none."""
+        record = self._history.at(place)
+        return b"" if record is None else pack(record)
 
     def dtc_status(self, code: Code) -> int:
         """Status byte of an alarm's DTC."""

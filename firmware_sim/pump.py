@@ -73,6 +73,8 @@ class Pump:
         self._answers = False  # the pump is one that acknowledges set-points
         self._awaited: set[int] = set()  # AckFor of what the last set-point has not been answered with
         self._rates: tuple[int, int] | None = None  # raw, of the last set-point
+        self.set_point = (0, 0, 0)  # the last one: operation, insulin raw, pramlintide raw
+        self.set_point_step = -NEVER
         self.refused = 0  # totals that fell without a reset, acknowledgements that were not Accepted
         self.unanswered = 0  # answers to set-points that never came
         self.misunderstood = 0  # set-points that the pump took for others
@@ -226,6 +228,8 @@ class Pump:
         self._rates = (rate, pramlintide_rate) if op == Op.SET_RATE else None
         rates = {"InsulinRate": rate, "PramlintideRate": pramlintide_rate} if op == Op.SET_RATE else {}
         self._commanded_rate = rate if op == Op.SET_RATE else 0 if op == Op.SUSPEND else None
+        self.set_point = (op, *(self._rates or (0, 0)))
+        self.set_point_step = step
         turn.send(
             "PUMP_BasalCmd",
             BasalOp=op,

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from .alarms import Code
+from .history import STEPS
 
 POSITIVE = 0x40
 NEGATIVE = 0x7F
@@ -46,6 +47,9 @@ DTC_BASE = 0xF00000
 
 SESSION_DID = 0xF186
 
+HISTORY_DID = 0x4000
+"""Of the record in place 0 of the history; the others follow."""
+
 DIDS_AT_MOST = 8
 """Of one request, so that the longest answer is known."""
 
@@ -60,6 +64,9 @@ class Device(Protocol):
 
     def identification(self) -> Mapping[int, bytes]:
         """Data by identifier."""
+
+    def history_at(self, place: int) -> bytes:
+        """The record in a place of the history; empty where there is none."""
 
     def dtc_status(self, code: Code) -> int:
         """Status byte of an alarm's DTC."""
@@ -174,10 +181,12 @@ class Uds:
         if not data or len(data) % 2 or len(data) > 2 * DIDS_AT_MOST:
             raise _Refused(WRONG_LENGTH)
         known = {**self._device.identification(), SESSION_DID: bytes([self._session])}
-        asked = [data[i : i + 2] for i in range(0, len(data), 2)]
-        found = b"".join(
-            name + known[int.from_bytes(name, "big")] for name in asked if int.from_bytes(name, "big") in known
-        )
+        found = b""
+        for name in (data[i : i + 2] for i in range(0, len(data), 2)):
+            number = int.from_bytes(name, "big")
+            in_history = HISTORY_DID <= number < HISTORY_DID + STEPS
+            value = self._device.history_at(number - HISTORY_DID) if in_history else known.get(number, b"")
+            found += name + value if value else b""
         if not found:
             raise _Refused(OUT_OF_RANGE)
         return found

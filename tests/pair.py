@@ -11,8 +11,8 @@ from typing import Any
 from pumpbench.conformance.loop import Loop, Values, Wire, pass_all
 
 from can_bus.frame import Frame
-from firmware_sim.firmware import NVM_WORDS, Cause, Firmware
-from firmware_sim.nvm import PowerLost, RamMemory, memory_size
+from firmware_sim.firmware import NVM_BYTES, Cause, Firmware
+from firmware_sim.nvm import PowerLost, RamMemory
 
 __all__ = ["TOKENS", "Pair", "Values", "Wire", "pass_all"]
 
@@ -23,7 +23,7 @@ class Pair(Loop):
     """One run of both sides; power fails when `cut_at_frame` frames have reached the device, or within a write."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.memory = RamMemory(memory_size(NVM_WORDS))
+        self.memory = RamMemory(NVM_BYTES)
         self.firmware = Firmware(self.memory)
         super().__init__(self.firmware, *args, **kwargs)
         self.frames_in = 0  # frames that reached the device

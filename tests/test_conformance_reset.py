@@ -14,8 +14,8 @@ from firmware_sim.alarms import Alarms
 from firmware_sim.bolus import Boluses, Op, Phase
 from firmware_sim.calibration import Calibration
 from firmware_sim.cgm import Cgm
-from firmware_sim.firmware import NVM_WORDS, Firmware
-from firmware_sim.nvm import ERASED, RamMemory, memory_size
+from firmware_sim.firmware import NVM_BYTES, Firmware
+from firmware_sim.nvm import ERASED, RamMemory
 from firmware_sim.pump import Pump
 
 MAX_BASAL = 3
@@ -93,7 +93,7 @@ def test_a_device_without_a_memory() -> None:
 
 def remembering(erased_by: tuple[MemoryState, ...], after: Callable[[Firmware], None] = lambda _: None) -> InProcess:
     """The reference with a memory that only these take away, and what it does when it starts with one."""
-    memory = RamMemory(memory_size(NVM_WORDS))
+    memory = RamMemory(NVM_BYTES)
 
     def build(state: MemoryState | None) -> Firmware:
         if state is None or state in erased_by:

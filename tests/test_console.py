@@ -23,8 +23,8 @@ from can_bus.lockstep import Turn
 from firmware_sim.__main__ import attend
 from firmware_sim.alarms import Alarms, Code
 from firmware_sim.console import LINE_MAX, LOG_LINES, Console, FirmwareView
-from firmware_sim.firmware import NVM_WORDS, Firmware
-from firmware_sim.nvm import RamMemory, memory_size
+from firmware_sim.firmware import NVM_BYTES, Firmware
+from firmware_sim.nvm import RamMemory
 from firmware_sim.serial_port import PENDING_MAX, PortError, SerialPort
 
 
@@ -82,7 +82,7 @@ def test_version_and_help_and_prompt(bench: Bench) -> None:
     console = Console(bench.firmware)  # type: ignore[arg-type]
     assert console.feed(b"version\n").startswith(b"version\r\nfirmware=0.2 protocol=1.3 dbc_crc=")
     assert console.feed(b"\r\n").endswith(b"> ")
-    assert console.feed(b"helq\x7fp\r").count(b"\r\n") == 11
+    assert console.feed(b"helq\x7fp\r").count(b"\r\n") == 12
 
 
 def test_log_lines_have_simulated_time_and_the_oldest_are_dropped(bench: Bench) -> None:
@@ -122,7 +122,7 @@ def test_a_flood_on_the_console_changes_no_frame() -> None:
 
 
 def test_a_reset_is_asked_for_where_there_is_a_memory() -> None:
-    firmware = Firmware(RamMemory(memory_size(NVM_WORDS)))
+    firmware = Firmware(RamMemory(NVM_BYTES))
     assert say(Console(firmware), "reset") == ["OK"]
     assert firmware.reset_requested
 

@@ -12,9 +12,9 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Phase
 from firmware_sim.alarms import Code
 from firmware_sim.e2e_window import E2eWindow, Validity
-from firmware_sim.firmware import CYCLIC, NVM_WORDS, Firmware
+from firmware_sim.firmware import CYCLIC, NVM_BYTES, Firmware
 from firmware_sim.ladder import State
-from firmware_sim.nvm import RamMemory, memory_size
+from firmware_sim.nvm import RamMemory
 
 CHECKS = {
     "g": (Check.OK,),
@@ -170,7 +170,7 @@ def test_what_the_pump_says_while_it_is_not_valid_is_not_believed() -> None:
 
 
 def test_a_reset_begins_without_data() -> None:
-    memory = RamMemory(memory_size(NVM_WORDS))
+    memory = RamMemory(NVM_BYTES)
     bench = Bench(mode=S2, firmware=Firmware(memory))
     bench.run(5)
     disturb(bench, "CGM_Reading", "gcc")

@@ -21,8 +21,8 @@ from can_bus.frame import Frame
 from can_bus.gateway import Gateway, Side
 from can_bus.lockstep import Done, Phase
 from can_bus.node_control import CommandControl, NodeControlError, SocketControl, attend
-from firmware_sim.firmware import NVM_WORDS
-from firmware_sim.nvm import Nvm, RamMemory, memory_size
+from firmware_sim.firmware import NVM_BYTES, NVM_WORDS
+from firmware_sim.nvm import Nvm, RamMemory
 from plant_server.physiology import load_patient
 
 MIXED = [
@@ -111,7 +111,7 @@ def test_power_lost_behind_each_frame_of_a_meal(after: int) -> None:
 
 
 def test_a_torn_write_leaves_the_record_before_it() -> None:
-    memory = RamMemory(memory_size(NVM_WORDS))
+    memory = RamMemory(NVM_BYTES)
     tear(memory, NVM_WORDS)  # nothing to tear
     assert memory.read(0, memory.size) == b"\xff" * memory.size
     nvm = Nvm(memory, NVM_WORDS)

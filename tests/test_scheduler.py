@@ -9,9 +9,9 @@ import firmware_sim.control.limits
 from can_bus.lockstep import STEP_SECONDS, Done
 from firmware_sim import selftest
 from firmware_sim.alarms import Code
-from firmware_sim.firmware import FRAMES_AT_MOST, NVM_WORDS, Firmware
+from firmware_sim.firmware import FRAMES_AT_MOST, NVM_BYTES, Firmware
 from firmware_sim.ladder import State
-from firmware_sim.nvm import RamMemory, memory_size
+from firmware_sim.nvm import RamMemory
 from firmware_sim.scheduler import BITES_AFTER, Scheduler, Task
 from firmware_sim.selftest import PATTERNS, Failure, check_program, check_ram
 
@@ -173,7 +173,7 @@ def test_a_lost_memory_leaves_nothing_to_command_with() -> None:
 
 
 def broken() -> RamMemory:
-    memory = RamMemory(memory_size(NVM_WORDS))
+    memory = RamMemory(NVM_BYTES)
     memory.write(0, bytes(range(256)))
     return memory
 

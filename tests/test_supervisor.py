@@ -14,9 +14,9 @@ from firmware_sim.cgm import Cgm
 from firmware_sim.control import layout
 from firmware_sim.control.core import follow_trend
 from firmware_sim.control.limits import limit_rate
-from firmware_sim.firmware import NVM_WORDS, Firmware
+from firmware_sim.firmware import NVM_BYTES, Firmware
 from firmware_sim.ladder import Ladder, State
-from firmware_sim.nvm import RamMemory, memory_size
+from firmware_sim.nvm import RamMemory
 from firmware_sim.pump import Op
 
 OK, BELOW, ABOVE = 1, 4, 5
@@ -758,7 +758,7 @@ def test_instances_go_on_after_a_reset_and_wrap() -> None:
 
 
 def test_a_reset_uses_no_instance_twice() -> None:
-    memory = RamMemory(memory_size(NVM_WORDS))
+    memory = RamMemory(NVM_BYTES)
     bench = Bench(firmware=Firmware(memory))
     bench.run(5)
     (before,) = bench.step(540).alarms(Code.URGENT_LOW)

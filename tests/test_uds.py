@@ -28,8 +28,8 @@ from can_bus.frame import Frame
 from can_bus.lockstep import Done
 from firmware_sim import selftest
 from firmware_sim.alarms import Code
-from firmware_sim.firmware import NVM_WORDS, Firmware
-from firmware_sim.nvm import RamMemory, memory_size
+from firmware_sim.firmware import NVM_BYTES, Firmware
+from firmware_sim.nvm import RamMemory
 from firmware_sim.selftest import Failure
 from firmware_sim.uds import AVAILABLE, DIDS_AT_MOST, dtc
 
@@ -93,7 +93,7 @@ class Line(BaseConnection):
 
 
 def new_memory() -> RamMemory:
-    return RamMemory(memory_size(NVM_WORDS))
+    return RamMemory(NVM_BYTES)
 
 
 class Station:

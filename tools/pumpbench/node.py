@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from can_bus.faults import MemoryState
 from can_bus.frame import Frame
-from firmware_sim.nvm import ERASED, HEADER_WORDS, FileMemory, Memory, RamMemory, bank_size, memory_size
+from firmware_sim.nvm import ERASED, HEADER_WORDS, FileMemory, Memory, RamMemory, bank_size
 
 if TYPE_CHECKING:
     from pumpbench.rig import Child
@@ -40,10 +40,10 @@ class InProcess:
     """The reference firmware in this process, with a memory that outlives it."""
 
     def __init__(self) -> None:
-        from firmware_sim.firmware import NVM_WORDS, Firmware  # noqa: PLC0415
+        from firmware_sim.firmware import NVM_BYTES, NVM_WORDS, Firmware  # noqa: PLC0415
 
         self._words = NVM_WORDS
-        self._memory = RamMemory(memory_size(NVM_WORDS))
+        self._memory = RamMemory(NVM_BYTES)
         self.firmware: Firmware = Firmware(self._memory)
         self.said: list[Frame] = []  # by a firmware that has just started
 
@@ -119,12 +119,12 @@ class Process:
             self.expected_dead = False
 
     def _tear(self) -> None:
-        from firmware_sim.firmware import NVM_WORDS  # noqa: PLC0415
+        from firmware_sim.firmware import NVM_BYTES, NVM_WORDS  # noqa: PLC0415
 
         size = self._nvm.stat().st_size
-        if size != memory_size(NVM_WORDS):
+        if size != NVM_BYTES:
             raise ValueError(
-                f"{self._nvm}: a torn memory needs the layout of the reference firmware, {memory_size(NVM_WORDS)} bytes"
+                f"{self._nvm}: a torn memory needs the layout of the reference firmware, {NVM_BYTES} bytes"
             )
         memory = FileMemory(str(self._nvm), size)
         tear(memory, NVM_WORDS)

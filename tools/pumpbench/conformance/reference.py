@@ -2,15 +2,15 @@
 
 from can_bus.faults.nodes import MemoryState
 from can_bus.lockstep import Node
-from firmware_sim.firmware import NVM_WORDS, Cause, Firmware
-from firmware_sim.nvm import ERASED, RamMemory, memory_size
+from firmware_sim.firmware import NVM_BYTES, NVM_WORDS, Cause, Firmware
+from firmware_sim.nvm import ERASED, RamMemory
 from pumpbench.conformance.device import InProcess
 from pumpbench.node import tear
 
 
 def reference() -> InProcess:
     """The reference firmware with a memory that outlives it."""
-    memory = RamMemory(memory_size(NVM_WORDS))
+    memory = RamMemory(NVM_BYTES)
 
     def build(state: MemoryState | None) -> Node:
         if state == "torn":
