@@ -1,4 +1,4 @@
-"""Console and diagnostics (DIA): a tester may look, and changes nothing."""
+"""Console and diagnostics (DIA): a tester may look, and changes nothing; what was done can be read afterwards."""
 
 import random
 from collections.abc import Callable
@@ -6,17 +6,34 @@ from typing import Final
 
 from can_bus import codec
 from can_bus.frame import Frame
+from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Phase
 from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES
 from pumpbench.conformance.checks.e2e import carbs_mode, difference, idle_boluses
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, expect
-from pumpbench.conformance.loop import Values
+from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, Op, expect
+from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, check
 
 REQUEST: Final = codec.message("UDS_Request")
 RESPONSE: Final = codec.message("UDS_Response")
 
 STEPS: Final = 16
+
+READ_DATA: Final = 0x22
+FIRST, FLOW_CONTROL = 1, 3
+"""Kinds of frames of ISO-TP."""
+
+COMMIT: Final = codec.choice("PUMP_BolusCmd", "BolusOp", "Commit")
+
+HISTORY: Final = 0x4000
+"""DID of the record whose step leaves nothing when divided by the 288 steps of a day; docs/diagnostics.md."""
+
+RECORD: Final = (
+    ("step", 4), ("boots", 2), ("cause", 1), ("state", 1), ("mode", 1), ("op", 1), ("glucose", 2), ("iob", 2),
+    ("rate", 2), ("pram_rate", 2), ("bolus", 2), ("pram_bolus", 2), ("delivered", 4), ("pram_delivered", 4),
+    ("limiters", 2), ("alarms", 4),
+)  # fmt: skip
+"""Fields and their bytes: signed, big-endian."""
 
 SESSION_CONTROL, ECU_RESET = 0x10, 0x11
 
@@ -81,3 +98,81 @@ def _ask(bench: Bench, requests: list[bytes]) -> None:
         for frame in bench.firmware.receive(request):
             bench.log.append(frame)
             expect(frame.can_id == RESPONSE.can_id, f"nothing but UDS_Response out of turn; {frame_text(frame)} came")
+
+
+@check("DIA-02", needs=["uds", "restart", "nvm"])
+def the_history(dut: Dut) -> None:
+    """A run with a meal and lost samples, then a loss of power: each step's record is what was on the bus.
+
+    Set-point, boluses, state, mode, limits and alarms of every step, in the long form of all that has to be kept.
+    Glucose and delivered amounts are as the device takes them, and not compared.
+    """
+    steps = dut.settings.diagnostics.history * 3600 // STEP_SECONDS if dut.long else 24
+    strategy = next((name for name in ("s3", "ma", "s1", "sma") if name in dut.offers), "nma")
+    loop = dut.loop(strategy, [(step + 8, 60.0) for step in range(0, steps, 60)], steps)
+    loop.to_device = lambda name, _values, _frame: (
+        [] if name == "CGM_Reading" and 14 <= loop.plant.step % STEPS_PER_DAY < 20 else None
+    )
+    loop.play()
+    dut.restart("kept")
+    for step, expected in _of_the_bus(loop).items():
+        found = _record(loop, HISTORY + step % STEPS_PER_DAY)
+        other = {name: (value, found[name]) for name, value in expected.items() if found[name] != value}
+        text = ", ".join(f"{name} {value} and not {wrong}" for name, (value, wrong) in other.items())
+        expect(not other, f"the record of step {step} to say what was on the bus: {text}")
+
+
+def _of_the_bus(loop: Loop) -> dict[int, dict[str, int]]:
+    """What the frames say of each step, by the fields of a record."""
+    said: dict[int, dict[str, int]] = {}
+    alarms: dict[int, int] = {}  # CtrlAlarmCode -> its newest state
+    committed: set[int] = set()
+    fields: dict[str, int] = {}
+    for _, name, values in loop.heard:
+        if name == "SYNC_Step":
+            if values["SyncPhase"] == Phase.STEP:
+                fields = {"step": values["StepIndex"], "op": 0, "rate": 0, "pram_rate": 0, "bolus": 0, "pram_bolus": 0}
+        elif name == "PUMP_BasalCmd":
+            fields["op"] = values["BasalOp"]
+            if values["BasalOp"] == Op.SET_RATE:
+                fields |= {"rate": values["InsulinRate"], "pram_rate": values["PramlintideRate"]}
+        elif name == "PUMP_BolusCmd" and values["BolusOp"] == COMMIT and values["BolusId"] not in committed:
+            committed.add(values["BolusId"])
+            fields |= {"bolus": values["InsulinBolus"]} if "InsulinBolus" in values else {}
+            fields |= {"pram_bolus": values["PramlintideBolus"]} if "PramlintideBolus" in values else {}
+        elif name == "CTRL_Alarm":
+            alarms[values["CtrlAlarmCode"]] = values["CtrlAlarmState"]
+        elif name == "CTRL_Status":
+            fields |= {"state": values["CtrlState"], "mode": values["CtrlMode"], "limiters": values["LimiterBits"]}
+            fields |= {"boots": 0, "alarms": sum(1 << code for code, state in alarms.items() if state)}
+            said[fields["step"]] = fields
+    return said
+
+
+def _record(loop: Loop, did: int) -> dict[str, int]:
+    """Read a record over ISO-TP: a first frame, flow control, and the frames that it lets through."""
+    request = bytes([READ_DATA, did >> 8, did & 0xFF])
+    answer = _converse(loop, _single(request))
+    expect(len(answer) == 1 and answer[0][0] >> 4 == FIRST, f"a first frame for DID 0x{did:04X}; {_hex(answer)} came")
+    length = (answer[0][0] & 0xF) << 8 | answer[0][1]
+    data = answer[0][2:] + b"".join(frame[1:] for frame in _converse(loop, bytes([FLOW_CONTROL << 4, 0, 0])))
+    size = 3 + sum(width for _, width in RECORD)
+    expect(length == size <= len(data), f"{size} bytes in answer to DID 0x{did:04X}; {length} came")
+    values, start = {}, 3
+    for name, width in RECORD:
+        values[name] = int.from_bytes(data[start : start + width], "big", signed=True)
+        start += width
+    return values
+
+
+def _converse(loop: Loop, data: bytes) -> list[bytes]:
+    """A tester's frame, and the device's."""
+    request = Frame(REQUEST.can_id, data.ljust(REQUEST.length, b"\xcc"))
+    loop.watch([request])
+    answer = loop.give(request)
+    loop.watch(answer)
+    return [frame.data for frame in answer if frame.can_id == RESPONSE.can_id]
+
+
+def _hex(frames: list[bytes]) -> str:
+    return ", ".join(frame.hex(" ") for frame in frames) or "nothing"
