@@ -10,18 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pumpbench.capture import Capture, Frames, read_candump, write_candump
-from pumpbench.recording import (
-    APPLICATION,
-    RecordingError,
-    clock,
-    describe,
-    notes,
-    quiet_environment,
-    rerun_binary,
-    state_changes,
-    write_recording,
-)
-from pumpbench.snapshot import snapshot
+from pumpbench.recording.columns import describe
+from pumpbench.recording.file import APPLICATION, write_recording
+from pumpbench.recording.snapshot import snapshot
+from pumpbench.recording.tool import RecordingError, quiet_environment, rerun_binary
+from pumpbench.story import clock, notes, state_changes
 from pumpbench.trace import Trace
 from rerun.chunk import RrdReader
 from synthetic_capture import Loop, as_frames, dropping, random_frames
@@ -240,9 +233,9 @@ def test_snapshot_of_nothing(tmp_path: Path) -> None:
 
 
 def test_only_who_writes_a_recording_imports_rerun() -> None:
-    modules = "capture, trace, recording, summary, runfolder, snapshot"
     code = (
-        f"import sys\nfrom pumpbench import {modules}\n"
+        "import sys\nfrom pumpbench import capture, runfolder, story, summary, trace\n"
+        "from pumpbench.recording import columns, file, layout, snapshot\n"
         "print([m for m in ('rerun', 'matplotlib', 'pyarrow', 'cantools') if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

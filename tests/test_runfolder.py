@@ -83,7 +83,7 @@ def test_nothing_has_the_name_before_the_end(frames: Frames, tmp_path: Path, mon
 
 
 def test_a_failing_recording_is_named(frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pumpbench.recording.rerun_binary", lambda: "/bin/false")
+    monkeypatch.setattr("pumpbench.recording.tool.rerun_binary", lambda: "/bin/false")
     with pytest.raises(RunFolderError, match=r"cannot write recording\.rrd: rerun rrd optimize failed: no message"):
         RunFolder.create(tmp_path / "run").write_all(frames, INFO, METRICS)
     assert {"run.json", "bus.log", "trace.parquet", "metrics.json"} == {

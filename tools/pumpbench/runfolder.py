@@ -101,7 +101,7 @@ class RunFolder:
         Raises:
             RunFolderError: a file could not be written (a full disk); what was written stays in `<out>.partial`.
         """
-        from pumpbench.recording import write_recording  # noqa: PLC0415
+        from pumpbench.recording.file import write_recording  # noqa: PLC0415
         from pumpbench.summary import write_summary  # noqa: PLC0415
 
         info = self._info(frames, info, complete=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from can_bus.lockstep import STEP_SECONDS
-from pumpbench.recording import GREEN, LANES, STATE_COLOURS, clock, state_changes, title
+from pumpbench.story import GREEN, LANES, STATE_COLOURS, clock, state_changes, title
 from pumpbench.trace import Trace
 
 if TYPE_CHECKING:

@@ -13,7 +13,10 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from pumpbench.recording import APPLICATION, TIMELINE, blueprint, quiet_environment, rerun_binary
+from pumpbench.recording.columns import TIMELINE
+from pumpbench.recording.file import APPLICATION
+from pumpbench.recording.layout import blueprint
+from pumpbench.recording.tool import quiet_environment, rerun_binary
 from pumpbench.summary import write_summary
 from pumpbench.trace import Trace
 

@@ -1,0 +1,294 @@
+"""What is in a recording: a whole run as columns, not row by row, so that a day takes milliseconds.
+
+Glucose against CGM, commanded against delivered for both drugs, the stomach, states, alarms and injected faults as
+lanes, what happened as text, the bus with its error counters, and the table of raw frames.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from can_bus import codec
+from can_bus.lockstep import STEP_SECONDS
+from pumpbench.capture import Frames
+from pumpbench.story import (
+    BLUE,
+    GREEN,
+    GREY,
+    LANES,
+    ORANGE,
+    PINK,
+    PRIORITY_COLOURS,
+    PURPLE,
+    RED,
+    STATE_COLOURS,
+    TEAL,
+    WHITE,
+    YELLOW,
+    hue,
+    notes,
+    state_changes,
+)
+from pumpbench.trace import Trace, decode, signals
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[Any]
+
+TIMELINE: Final = "sim_time"
+
+
+def log_run(recording: Any, trace: Trace, frames: Frames, metrics: Mapping[str, Any] | None = None) -> None:
+    """Log a whole run into a `rerun.RecordingStream`.
+
+    Args:
+        recording: the stream; anything it is connected to gets the data.
+        trace: the decoded run.
+        frames: every frame of it.
+        metrics: content of metrics.json.
+    """
+    logger = _Logger(recording)
+    logger.run(trace, frames)
+    logger.properties(trace.info, metrics or {})
+
+
+class _Logger:
+    """Writes columns under entity paths."""
+
+    def __init__(self, recording: Any) -> None:
+        import rerun as rr  # noqa: PLC0415
+
+        self.rr = rr
+        self.recording = recording
+
+    def run(self, trace: Trace, frames: Frames) -> None:
+        end_s = max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
+        self.glucose(trace, end_s)
+        self.drugs(trace)
+        self.stomach(trace)
+        self.lanes(trace, end_s)
+        self.log(trace)
+        self.bus(trace, frames)
+
+    def send(self, path: str, time_s: Array, columns: Any) -> None:
+        self.recording.send_columns(path, indexes=[self.rr.TimeColumn(TIMELINE, duration=time_s)], columns=columns)
+
+    def scalars(self, path: str, time_s: Array, values: Array, *, gaps: bool = True) -> bool:
+        """A series; with `gaps`, missing values break the line, else they are left out."""
+        known = ~np.isnan(values)
+        if not known.any():
+            return False
+        rows = slice(None) if gaps else known
+        self.send(path, time_s[rows], self.rr.Scalars.columns(scalars=values[rows]))
+        return True
+
+    def line(
+        self,
+        path: str,
+        trace: Trace,
+        values: Array,
+        name: str,
+        colour: tuple[int, int, int],
+        width: float = 2.0,
+        *,
+        step: bool = False,
+    ) -> None:
+        if self.scalars(path, trace.time_s, values):
+            mode = (
+                self.rr.components.InterpolationMode.StepAfter if step else self.rr.components.InterpolationMode.Linear
+            )
+            style = self.rr.SeriesLines(names=name, colors=[colour], widths=[width], interpolation_mode=mode)
+            self.recording.log(path, style, static=True)
+
+    def points(
+        self,
+        path: str,
+        time_s: Array,
+        values: Array,
+        name: str,
+        colour: tuple[int, int, int],
+        marker: str = "circle",
+        size: float = 2.0,
+    ) -> None:
+        if self.scalars(path, time_s, values, gaps=False):
+            style = self.rr.SeriesPoints(names=name, colors=[colour], markers=[marker], marker_sizes=[size])
+            self.recording.log(path, style, static=True)
+
+    def properties(self, info: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
+        flat = {key: value for key, value in info.items() if isinstance(value, str | int | float)}
+        if flat:
+            self.recording.send_property("run", self.rr.AnyValues(**flat))
+        parts = [
+            f"## {heading}\n\n```json\n{json.dumps(content, indent=2, default=str)}\n```\n"
+            for heading, content in (("Outcome (metrics.json)", metrics), ("Run (run.json)", info))
+            if content
+        ]
+        if parts:
+            self.recording.log("run", self.rr.TextDocument("\n".join(parts), media_type="text/markdown"), static=True)
+
+    def glucose(self, trace: Trace, end_s: float) -> None:
+        for limit, colour in ((70.0, RED), (180.0, ORANGE)):
+            path = f"limits/{limit:.0f}"
+            self.send(path, np.array([0.0, end_s]), self.rr.Scalars.columns(scalars=np.full(2, limit)))
+            style = self.rr.SeriesLines(names=f"limit {limit:.0f}", colors=[colour], widths=[1.0])
+            self.recording.log(path, style, static=True)
+        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", WHITE)
+        self.line("glucose/interstitial", trace, trace.get("TruthInterstitial"), "interstitial", GREY, 1.0)
+        self.points("glucose/cgm", trace.time_s, trace.get("GlucoseConc"), "CGM", BLUE)
+        meals = np.array([meal.time_s for meal in trace.meals])
+        self.points("glucose/meal", meals, np.full(len(meals), 48.0), "meal (see log)", GREEN, "up", 5.0)
+
+    def drugs(self, trace: Trace) -> None:
+        for name, drug, colour, unit in (("insulin", "Insulin", BLUE, "U"), ("pramlintide", "Pram", TEAL, "ug")):
+            commanded, delivered = trace.get(f"{drug}RateCommanded"), trace.basal_delivered(drug)
+            self.line(f"{name}/delivered", trace, delivered, f"delivered [{unit}/h]", ORANGE, 3.5, step=True)
+            self.line(f"{name}/rate_commanded", trace, commanded, f"commanded [{unit}/h]", colour, 1.8, step=True)
+            for kind, tint, marker in (("Commanded", colour, "diamond"), ("Delivered", ORANGE, "circle")):
+                bolus = trace.get(f"{drug}Bolus{kind}")
+                given = np.where(bolus > 0, bolus, np.nan)
+                path = f"{name}/bolus_{kind.lower()}"
+                self.points(path, trace.time_s, given, f"bolus {kind.lower()} [{unit}]", tint, marker, 4.0)
+        self.line("body/plasma_insulin", trace, trace.get("TruthInsulin"), "insulin [mU/L]", BLUE)
+        self.line("body/plasma_pramlintide", trace, trace.get("TruthPramlintide"), "pramlintide [pmol/L]", TEAL)
+        self.line("body/insulin_on_board", trace, trace.get("InsulinOnBoard"), "IOB, firmware [U]", PURPLE)
+
+    def stomach(self, trace: Trace) -> None:
+        self.line("stomach/eta", trace, trace.get("TruthEta") * 100, "emptying η [%]", PINK)
+        self.line("stomach/content", trace, trace.get("TruthQsto") / 1000, "content [g]", GREEN)
+        self.line("stomach/appearance", trace, trace.get("TruthRa") * 10, "Ra [0.1 mg/kg/min]", GREY, 1.0)
+
+    def lanes(self, trace: Trace, end_s: float) -> None:
+        lanes = [lane for lane in LANES if lane[0] in trace.columns]
+        for signal, what in (("InsulinOcclusion", "insulin_line"), ("PramOcclusion", "pramlintide_line")):
+            if np.nan_to_num(trace.get(signal)).any():
+                lanes.append((signal, "PUMP_Status", what))
+        for order, (signal, message, what) in enumerate(lanes):
+            changes = state_changes(trace, signal, message)
+            self.states(f"state/{order + 1}_{what}", changes, STATE_COLOURS.get(signal, {}))
+        self.alarms(trace)
+        spans: dict[str, list[tuple[float, str]]] = {}
+        for span in trace.fault_spans():
+            kind = span.label.split(" ", 1)[0]
+            spans.setdefault(span.label, []).extend([(span.start_s, kind), (span.end_s, "")])
+        for label, changes in spans.items():
+            self.states(f"fault/{label.replace(' ', '_')}", changes, {label.split(" ", 1)[0]: RED})
+
+    def alarms(self, trace: Trace) -> None:
+        """A lane for each alarm code of each node: the state of its newest instance, in the colour of its priority."""
+        lanes: dict[str, list[tuple[float, str]]] = {}
+        standing: dict[str, set[int]] = {}
+        tints: dict[str, dict[str, tuple[int, int, int]]] = {}
+        for alarm in trace.alarms:
+            lane = f"alarm/{alarm.code}_{alarm.node}"
+            instances = standing.setdefault(lane, set())
+            if alarm.state == "Inactive":
+                instances.discard(alarm.instance)
+                if not instances:
+                    lanes.setdefault(lane, []).append((alarm.time_s, ""))
+            else:
+                instances.add(alarm.instance)
+                tints.setdefault(lane, {})[alarm.state] = PRIORITY_COLOURS.get(alarm.priority, GREY)
+                lanes.setdefault(lane, []).append((alarm.time_s, alarm.state))
+        for lane, changes in lanes.items():
+            self.states(lane, changes, tints.get(lane, {}))
+
+    def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, tuple[int, int, int]]) -> None:
+        if not changes:
+            return
+        times, names = zip(*changes, strict=True)
+        shown = sorted({name for name in names if name})
+        self.recording.log(
+            path,
+            self.rr.StateConfiguration(
+                values=shown, labels=shown, colors=[colours.get(name, hue(name)) for name in shown]
+            ),
+            static=True,
+        )
+        self.send(path, np.array(times), self.rr.StateChange.columns(state=list(names)))
+
+    def log(self, trace: Trace) -> None:
+        lines = notes(trace)
+        if lines:
+            self.send(
+                "log",
+                np.array([line.time_s for line in lines]),
+                self.rr.TextLog.columns(
+                    text=[line.text for line in lines],
+                    level=[line.kind for line in lines],
+                    color=[line.colour for line in lines],
+                ),
+            )
+
+    def bus(self, trace: Trace, frames: Frames) -> None:
+        names = {0: "device", 1: "plant"}
+        first = int(trace.step[0]) if len(trace) else 0
+        for channel in sorted(set(frames.channel.tolist())):
+            rows = frames.channel == channel
+            for path, what, mask, colour in (
+                ("frames", "frames/step", rows, GREEN if channel == 0 else GREY),
+                ("refused", "damaged", rows & ~frames.intact, RED),
+            ):
+                count = np.bincount(frames.step[mask] - first, minlength=len(trace)).astype(float)
+                if path == "frames" or count.any():
+                    label = f"{what}, {names.get(channel, channel)}"
+                    self.line(f"bus/{path}_{channel}", trace, count, label, colour, step=True)
+            self.table(f"can/can{channel}", frames.select(np.flatnonzero(rows)))
+        for signal, what, colour in (
+            ("LostFrameCount", "lost", ORANGE),
+            ("E2eErrorCount", "checksum errors", RED),
+            ("SequenceErrorCount", "out of sequence", PURPLE),
+            ("SaturationCount", "saturations", YELLOW),
+        ):
+            self.line(f"bus/{signal}", trace, trace.get(signal), what, colour, step=True)
+
+    def table(self, path: str, frames: Frames) -> None:
+        """Every frame of a bus as a row: id, name and bytes, and a line of text with the decoded values."""
+        by_id = {message.can_id: message.name for message in codec.messages().values()}
+        ids, index = np.unique(frames.can_id, return_inverse=True)
+        texts = np.array([f"0x{ident:03X}" for ident in ids.tolist()])[index].tolist()
+        known = np.array([by_id.get(ident, "unknown") for ident in ids.tolist()])[index].tolist()
+        data, lengths = frames.data.tobytes().hex(" ").upper(), frames.length.tolist()
+        payloads = [data[24 * row : 24 * row + max(3 * length - 1, 0)] for row, length in enumerate(lengths)]
+        values = describe(frames)
+        lines = [
+            f"{time_s:.5f}  {ident[2:]}#{payload.replace(' ', '')}  {value}"
+            for time_s, ident, payload, value in zip(frames.time_s.tolist(), texts, payloads, values, strict=True)
+        ]
+        good = frames.intact.tolist()
+        levels = [name if fine else f"{name}!" for name, fine in zip(known, good, strict=True)]
+        self.send(
+            path,
+            frames.time_s,
+            [
+                *self.rr.TextLog.columns(text=lines, level=levels),
+                *self.rr.AnyValues.columns(id=texts, data=payloads, step=frames.step.astype("i8")),
+            ],
+        )
+
+
+def describe(frames: Frames) -> list[str]:
+    """What each frame says, as `Signal=value unit` for every signal it carries; "" for a frame not to be believed."""
+    result = np.full(len(frames), "", object)
+    for message in codec.messages().values():
+        decoded = decode(frames, message.name)
+        if not len(decoded.rows):
+            continue
+        parts: list[list[str]] = []
+        for name, signal in signals(message.name).items():
+            raw = decoded.raw[name]
+            codes, index = np.unique(raw, return_inverse=True)
+            if signal.choices:
+                texts = [signal.choices.get(code) or signal.text(code) for code in codes.tolist()]
+            else:
+                texts = [signal.text(code) for code in codes.tolist()]
+            column = np.array([f"{name}={text}" for text in texts], object)[index]
+            column[~decoded.valid[name]] = ""
+            parts.append(column.tolist())
+        result[decoded.rows] = [" ".join(filter(None, row)) for row in zip(*parts, strict=True)]
+    texts_out: list[str] = result.tolist()
+    return texts_out

@@ -1,0 +1,140 @@
+"""What happened in a run, in words and colours: what every picture, recording and page of it tells alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pumpbench.trace import Trace, labels
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[Any]
+
+GREY, WHITE, BLUE, ORANGE = (150, 150, 150), (205, 205, 205), (64, 156, 255), (255, 152, 38)
+GREEN, RED, YELLOW, PURPLE, TEAL, PINK = (
+    (88, 190, 96),
+    (229, 57, 53),
+    (240, 200, 60),
+    (171, 104, 220),
+    (38, 178, 172),
+    (236, 96, 160),
+)
+
+STATE_COLOURS: Final[Mapping[str, Mapping[str, tuple[int, int, int]]]] = {
+    "CtrlState": {
+        "Init": GREY,
+        "Auto": GREEN,
+        "Degraded": YELLOW,
+        "SafeBasal": ORANGE,
+        "Suspended": PURPLE,
+        "Fault": RED,
+        "DeliveryUncertain": PINK,
+    },
+    "PumpState": {
+        "Off": GREY,
+        "Priming": TEAL,
+        "Waiting": TEAL,
+        "Running": GREEN,
+        "Suspended": PURPLE,
+        "Stopped": ORANGE,
+        "Fault": RED,
+    },
+    "CgmState": {
+        "Warmup": GREY,
+        "Ok": GREEN,
+        "CalibrationNeeded": YELLOW,
+        "TempInvalid": YELLOW,
+        "BelowRange": ORANGE,
+        "AboveRange": ORANGE,
+        "SensorFault": RED,
+        "Expired": PURPLE,
+    },
+    "InsulinOcclusion": {"Clear": GREEN, "Suspected": YELLOW, "Occluded": RED},
+    "PramOcclusion": {"Clear": GREEN, "Suspected": YELLOW, "Occluded": RED},
+}
+"""Colours of the states, by name; the summary picture uses the same ones."""
+
+LANES: Final[tuple[tuple[str, str, str], ...]] = (
+    ("CtrlState", "CTRL_Status", "firmware"),
+    ("PumpState", "PUMP_Status", "pump"),
+    ("CgmState", "CGM_Reading", "sensor"),
+    ("CtrlMode", "CTRL_Status", "strategy"),
+)
+"""State lanes: signal, message, what a reader calls it."""
+
+
+PRIORITY_COLOURS: Final = {"High": RED, "Medium": ORANGE, "Low": YELLOW}
+
+
+def clock(time_s: float) -> str:
+    """Simulated time as people read it: `d0 13:05` is 13:05 on the first day."""
+    minutes = int(time_s // 60)
+    return f"d{minutes // 1440} {minutes // 60 % 24:02d}:{minutes % 60:02d}"
+
+
+@dataclass(frozen=True)
+class Note:
+    """A line of the log: when (simulated s), which kind (ALARM, FAULT, MEAL, STATE), what, and its colour."""
+
+    time_s: float
+    kind: str
+    text: str
+    colour: tuple[int, int, int]
+
+
+def notes(trace: Trace) -> list[Note]:
+    """What happened, in order of time: alarms, injected faults, meals, changes of the firmware's state."""
+    found = [
+        Note(
+            alarm.time_s,
+            "ALARM",
+            f"{alarm.node} {alarm.code} {'over' if alarm.state == 'Inactive' else alarm.state.lower()}"
+            f" ({alarm.priority.lower()})",
+            GREY if alarm.state == "Inactive" else PRIORITY_COLOURS.get(alarm.priority, WHITE),
+        )
+        for alarm in trace.alarms
+    ]
+    for span in trace.fault_spans():
+        minutes = round((span.end_s - span.start_s) / 60)
+        found.append(Note(span.start_s, "FAULT", f"{span.label} for {minutes} min", RED))
+    found += [Note(meal.time_s, "MEAL", f"{meal.carbs_g:.0f} g of carbohydrate", GREEN) for meal in trace.meals]
+    for start, text in state_changes(trace, "CtrlState", "CTRL_Status"):
+        if text:
+            found.append(Note(start, "STATE", f"firmware {text}", STATE_COLOURS["CtrlState"].get(text, GREY)))
+    found.sort(key=lambda note: note.time_s)
+    return [Note(note.time_s, note.kind, f"{clock(note.time_s)}  {note.text}", note.colour) for note in found]
+
+
+def state_changes(trace: Trace, signal: str, message: str) -> list[tuple[float, str]]:
+    """When a state begins and its name; "" where the step had no frame that says it."""
+    column = trace.columns.get(signal)
+    if column is None:
+        return []
+    names = labels(message, signal)
+    codes = np.where(np.isnan(column), -1, column).astype(int)
+    if len(codes) > 1 and codes[-1] == -1:
+        codes = codes[:-1]  # the final instant asks for no answer
+    starts: Array = np.flatnonzero(np.append(True, codes[1:] != codes[:-1])[: len(codes)])
+    return [
+        (float(trace.time_s[row]), "" if codes[row] == -1 else names.get(int(codes[row]), str(codes[row])))
+        for row in starts
+    ]
+
+
+def hue(name: str) -> tuple[int, int, int]:
+    """A calm colour for a name without a meaning of its own (strategies)."""
+    palette = [(96, 125, 139), (121, 134, 203), (77, 150, 170), (141, 110, 99), (130, 150, 110)]
+    return palette[sum(name.encode()) % len(palette)]
+
+
+def title(info: Mapping[str, Any]) -> str:
+    """One line that says which run this is."""
+    parts = [str(info[key]) for key in ("patient", "strategy", "scenario") if info.get(key)]
+    if info.get("seed") is not None:
+        parts.append(f"seed {info['seed']}")
+    return ", ".join(parts) or "pumpbench run"
