@@ -12,12 +12,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from can_bus import yaml_file
 
 from .scenarios.announcements import (
-    POLICIES,
-    POLICY_OF_MODE,
     Announcement,
     Kind,
     Policy,
     announcements,
+    policy_of,
     rescue_announcement,
 )
 from .scenarios.announcing import Announcing
@@ -30,8 +29,6 @@ from .scenarios.tuning import tuning
 __all__ = [
     "EATING_MINUTES",
     "MINUTES_PER_DAY",
-    "POLICIES",
-    "POLICY_OF_MODE",
     "RESCUE",
     "RESCUE_EATING_MINUTES",
     "SAMPLE_MINUTES",
@@ -48,6 +45,7 @@ __all__ = [
     "announcements",
     "built_in",
     "load_scenario",
+    "policy_of",
     "rescue_announcement",
 ]
 

@@ -5,7 +5,7 @@ from collections import deque
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 
-from .scenario import POLICY_OF_MODE, Announcement, Meal, Scenario, announcements, rescue_announcement
+from .scenario import Announcement, Meal, Scenario, announcements, policy_of, rescue_announcement
 from .scenarios.announcing import OFFSET_MAX
 
 IDS = 255
@@ -29,7 +29,7 @@ class User:
 
     def __init__(self, scenario: Scenario, mode: int, seed: int, patient: str) -> None:
         self._scenario = scenario
-        self._policy = POLICY_OF_MODE[mode]
+        self._policy = policy_of(mode)
         self._planned = deque(announcements(scenario, self._policy, seed, patient))
         self._waiting: deque[Announcement] = deque()  # due, the first one is being told
         self._number = 0  # MealId of the first one

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pumpbench.calibration import MODES
 from scipy import stats
 
-import dbc
 from can_bus import codec
 from plant_server import scenario as scenario_module
 from plant_server.physiology import load_patient
 from plant_server.scenario import (
-    POLICIES,
-    POLICY_OF_MODE,
     RESCUE,
     STEPS_PER_DAY,
     VALIDATION,
@@ -31,6 +29,7 @@ from plant_server.scenario import (
     announcements,
     built_in,
     load_scenario,
+    policy_of,
     rescue_announcement,
 )
 from plant_server.scenarios.announcing import Late
@@ -203,7 +202,7 @@ DAY = Scenario(
 
 
 def told(scenario: Scenario, mode: str, seed: int = 1) -> tuple[Announcement, ...]:
-    return announcements(scenario, POLICIES[mode], seed, PATIENT)
+    return announcements(scenario, policy_of(MODES[mode]), seed, PATIENT)
 
 
 @pytest.mark.parametrize("mode", ["ma", "s3"])
@@ -227,13 +226,10 @@ def test_without_announcements_nothing_is_told(mode: str) -> None:
 
 
 def test_modes_and_kinds_are_those_of_the_dbc() -> None:
-    choices = dbc.load().get_message_by_name("MODE_Cmd").get_signal_by_name("ModeRequest").choices
-    named = {code: str(label) for code, label in choices.items() if str(label) != "SNA"}
-    assert POLICY_OF_MODE.keys() == named.keys()
-    for code, label in named.items():
-        ending = {"NMA": Policy.NOTHING, "SMA": Policy.MAIN_MEALS, "MA": Policy.EVERYTHING}
-        expected = next((policy for text, policy in ending.items() if label.endswith(text)), Policy.NOTHING)
-        assert POLICY_OF_MODE[code] is expected, label
+    told = {name: policy_of(code) for name, code in MODES.items()}
+    assert {name for name, policy in told.items() if policy is Policy.EVERYTHING} == {"ma", "s3"}
+    assert {name for name, policy in told.items() if policy is Policy.MAIN_MEALS} == {"sma", "s4"}
+    assert {policy_of(mode) for mode in (0, 1, 15)} == {Policy.NOTHING}  # Off, OpenLoop, none
     for kind in Kind:
         label = kind.name.title().replace("_", "")
         assert codec.choice("MEAL_Announce", "MealKind", label) == kind

@@ -6,7 +6,10 @@ without, nothing.
 """
 
 import enum
+import functools
 from typing import NamedTuple
+
+import dbc
 
 from ..streams import stream
 from .meals import SAMPLE_MINUTES, SNACK, Meal, Scenario
@@ -32,29 +35,18 @@ class Policy(enum.Enum):
     EVERYTHING = "every meal and its carbohydrate"
 
 
-POLICIES = {
-    "nma": Policy.NOTHING,
-    "ma": Policy.EVERYTHING,
-    "sma": Policy.MAIN_MEALS,
-    "s1": Policy.NOTHING,
-    "s2": Policy.NOTHING,
-    "s3": Policy.EVERYTHING,
-    "s4": Policy.MAIN_MEALS,
-}
-"""By the paper's name of the mode."""
+@functools.cache
+def policy_of(mode: int) -> Policy:
+    """What is told in a mode, by the ending of its name in the DBC: ...MA, ...SMA, or anything else.
 
-POLICY_OF_MODE = {
-    0: Policy.NOTHING,  # Off
-    1: Policy.NOTHING,  # OpenLoop
-    2: Policy.NOTHING,  # InsulinNMA
-    3: Policy.EVERYTHING,  # InsulinMA
-    4: Policy.MAIN_MEALS,  # InsulinSMA
-    5: Policy.NOTHING,  # PramS1_BolusNMA
-    6: Policy.NOTHING,  # PramS2_RatioNMA
-    7: Policy.EVERYTHING,  # PramS3_BolusMA
-    8: Policy.MAIN_MEALS,  # PramS4_RatioSMA
-}
-"""By MODE_Cmd.ModeRequest."""
+    Args:
+        mode: MODE_Cmd.ModeRequest.
+    """
+    names = dbc.load().get_message_by_name("MODE_Cmd").get_signal_by_name("ModeRequest").choices or {}
+    name = str(names.get(mode, ""))
+    if name.endswith("SMA"):
+        return Policy.MAIN_MEALS
+    return Policy.EVERYTHING if name.endswith("MA") and not name.endswith("NMA") else Policy.NOTHING
 
 
 class Announcement(NamedTuple):
@@ -79,7 +71,7 @@ def announcements(scenario: Scenario, policy: Policy, seed: int, patient: str) -
 
     Args:
         scenario: its meals and the person's habits.
-        policy: of the mode, see `POLICIES` and `POLICY_OF_MODE`.
+        policy: of the mode, see `policy_of`.
         seed: of the run.
         patient: name of the virtual patient.
     """

@@ -20,7 +20,6 @@ from plant_server.pump import PumpSettings
 from plant_server.scenario import (
     BUILT_IN,
     EATING_MINUTES,
-    POLICY_OF_MODE,
     RESCUE,
     Announcement,
     Kind,
@@ -29,6 +28,7 @@ from plant_server.scenario import (
     Scenario,
     announcements,
     load_scenario,
+    policy_of,
     rescue_announcement,
 )
 from plant_server.sensor import STATE_OK, STATUS_EVERY, Sensor, SensorSettings, load_sensor
@@ -116,7 +116,7 @@ def prepare(case: Case) -> Plan:
     meals = tuple(meal for meal in scenario.meals if meal.step < steps)
     if any(meal.step < 0 for meal in meals):
         raise CaseError(f"scenario {scenario.name}: a meal starts before the run")
-    policy = POLICY_OF_MODE[mode]
+    policy = policy_of(mode)
     rescue = scenario.rescue
     sugar = None if rescue is None else rescue_announcement(scenario, policy, Meal(0, RESCUE, rescue.carbs))
     pump = PumpSettings(basal_milliunits_per_h=round(patient.basal_u_per_h * 1000))
