@@ -44,6 +44,9 @@ NOT_HERE = {
     "console /tmp/pump": "tests/test_console.py talks to it",
     ". .venv/bin/activate": "is active",
     "cd ../..": "is there",
+    "git apply": "tests/test_extending.py applies them",
+    "extending/filebus": "tests/test_extending.py installs it",
+    "filebus:": "tests/test_extending.py runs on it",
     'pytest --pumpbench-bus hub --pumpbench-firmware "./build/firmware': "tests/test_example_repository.py does it",
 }
 """Parts of commands that are not run here, and why not; their options are looked up all the same."""
