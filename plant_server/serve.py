@@ -66,7 +66,7 @@ def serve(
         now = time.monotonic()
         patience = connect_timeout if calling else step_timeout
         if not plant.finished and now > heard + patience:
-            raise MemberSilent(_silence(plant, patience))
+            raise MemberSilent(_silence(plant, patience, calling=calling))
         if calling and plant.late_answers > late:
             late = plant.late_answers
             every *= 2
@@ -75,5 +75,10 @@ def serve(
             link.send(plant.call_roll())
 
 
-def _silence(plant: PlantServer, seconds: float) -> str:
-    return f"waited {seconds:g} s for {plant.waiting_for}: the firmware is not on this bus, hangs, or lost a frame"
+def _silence(plant: PlantServer, seconds: float, *, calling: bool) -> str:
+    why = (
+        "the firmware is not on this bus, hangs, or speaks something else; `pumpbench doctor` looks closer"
+        if calling
+        else "the firmware hangs, forgot SYNC_Done, or lost a frame"
+    )
+    return f"waited {seconds:g} s for {plant.waiting_for}: {why}"
