@@ -131,7 +131,8 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     older = tmp_path / "python3.9"
     older.write_text(
-        f"#!{sys.executable}\nimport sys\nsys.version_info, sys.version = (3, 9, 2), '3.9.2 (default)'\nexec(sys.argv[2])\n"
+        f"#!{sys.executable}\nimport sys\n"
+        "sys.version_info, sys.version = (3, 9, 2), '3.9.2 (default)'\nexec(sys.argv[2])\n"
     )
     older.chmod(0o755)
     monkeypatch.setenv("COLUMNS", "120")
