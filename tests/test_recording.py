@@ -12,7 +12,7 @@ import pytest
 from pumpbench.capture import Capture, Frames, read_candump, write_candump
 from pumpbench.recording.columns import describe
 from pumpbench.recording.file import APPLICATION, write_recording
-from pumpbench.recording.snapshot import snapshot
+from pumpbench.recording.snapshot import Shot, snapshot
 from pumpbench.recording.tool import RecordingError, quiet_environment, rerun_binary
 from pumpbench.story import clock, notes, state_changes
 from pumpbench.trace import Trace
@@ -102,7 +102,7 @@ def test_series_are_the_columns_of_the_trace(run: Run) -> None:
     assert set(run.series("/limits/70").values()) == {70.0}
     commanded, delivered = run.series("/insulin/bolus_commanded"), run.series("/insulin/bolus_delivered")
     assert set(commanded) - set(delivered) == {156 * 300.0}  # the bolus during the occlusion
-    assert run.series("/bus/frames_0")[300 * 50.0] == np.sum((run.frames.step == 50) & (run.frames.channel == 0))
+    assert run.series("/bus/frames/0")[300 * 50.0] == np.sum((run.frames.step == 50) & (run.frames.channel == 0))
 
 
 def test_states_faults_and_log(run: Run) -> None:
@@ -160,7 +160,7 @@ def test_odd_frames_and_damaged_ones(tmp_path: Path) -> None:
     table = odd_run.columns("/can/can0")
     assert table["data"][-5:] == ["FF " * 7 + "FF", "00 " * 7 + "00", "00 " * 7 + "00", "", "00 " * 7 + "00"]
     assert table["TextLog:level"][-5:] == ["unknown!", "unknown!", "unknown!", "unknown!", "CGM_Reading!"]
-    assert sum(odd_run.series("/bus/refused_0").values()) == 5
+    assert sum(odd_run.series("/bus/errors/refused_0").values()) == 5
 
 
 @pytest.mark.parametrize("steps", [0, 1])
@@ -206,7 +206,7 @@ def size(png: Path) -> tuple[int, int]:
 def test_snapshot_by_the_viewer(run: Run, tmp_path: Path) -> None:
     png = tmp_path / "shot.png"
     run.trace.save(run.path.parent / "trace.parquet")
-    how = snapshot(run.path, png, size=(1200, 800), window=(3600.0, 6 * 3600.0))
+    how = snapshot(run.path, [Shot(png, window=(3600.0, 6 * 3600.0))], size=(1200, 800))
     if "Matplotlib" in how:
         pytest.skip(how)
     assert how == "drawn by Rerun's viewer, off-screen"  # and no view complains
@@ -222,20 +222,20 @@ def test_snapshot_without_a_vulkan_driver(run: Run, tmp_path: Path, monkeypatch:
     monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
     run.trace.save(run.path.parent / "trace.parquet")
-    how = snapshot(run.path, tmp_path / "shot.png")
+    how = snapshot(run.path, [Shot(tmp_path / "shot.png")])
     assert how.startswith("drawn by Matplotlib, because Rerun's viewer cannot draw here: it ended with status")
     assert size(tmp_path / "shot.png") == (1600, 1000)
 
 
 def test_snapshot_of_nothing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"none\.rrd is missing"):
-        snapshot(tmp_path / "none.rrd", tmp_path / "shot.png")
+        snapshot(tmp_path / "none.rrd", [Shot(tmp_path / "shot.png")])
 
 
 def test_only_who_writes_a_recording_imports_rerun() -> None:
     code = (
         "import sys\nfrom pumpbench import capture, runfolder, story, summary, trace\n"
-        "from pumpbench.recording import columns, file, layout, snapshot\n"
+        "from pumpbench.recording import columns, file, scene, snapshot, still\n"
         "print([m for m in ('rerun', 'matplotlib', 'pyarrow', 'cantools') if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from pumpbench.trace import Trace, labels
+from pumpbench.trace import AlarmEvent, Trace, labels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[Any]
 
-GREY, WHITE, BLUE, ORANGE = (150, 150, 150), (205, 205, 205), (64, 156, 255), (255, 152, 38)
+# Middle tones: the native viewer is dark, the one in the browser light.
+GREY, BLUE, ORANGE = (150, 150, 150), (64, 156, 255), (255, 152, 38)
 GREEN, RED, YELLOW, PURPLE, TEAL, PINK = (
     (88, 190, 96),
     (229, 57, 53),
@@ -87,6 +89,50 @@ class Note:
     colour: tuple[int, int, int]
 
 
+@dataclass(frozen=True)
+class AlarmSpan:
+    """An alarm from its first frame (simulated s) until it was over, inf if never; names are those of the DBC."""
+
+    start_s: float
+    end_s: float
+    node: str
+    code: str
+    priority: str
+
+
+def alarm_spans(trace: Trace) -> list[AlarmSpan]:
+    """Every alarm once, in order of time."""
+    standing: dict[tuple[str, int], AlarmEvent] = {}
+    spans = []
+    for alarm in trace.alarms:
+        key = alarm.node, alarm.instance
+        if alarm.state != "Inactive":
+            standing.setdefault(key, alarm)
+        elif key in standing:
+            spans.append(_span(standing.pop(key), alarm.time_s))
+    spans += [_span(alarm, math.inf) for alarm in standing.values()]
+    return sorted(spans, key=lambda span: (span.start_s, span.end_s, span.code))
+
+
+def _span(raised: AlarmEvent, end_s: float) -> AlarmSpan:
+    return AlarmSpan(raised.time_s, end_s, raised.node, raised.code, raised.priority)
+
+
+def without_reminders(alarms: Iterable[AlarmEvent]) -> list[AlarmEvent]:
+    """Each alarm raised, confirmed and over once: that a node repeats it while it stands says nothing new."""
+    told: dict[tuple[str, int], set[str]] = {}
+    found = []
+    for alarm in alarms:
+        states = told.setdefault((alarm.node, alarm.instance), set())
+        if alarm.state == "Inactive":
+            states.clear()
+        elif alarm.state in states:
+            continue
+        states.add(alarm.state)
+        found.append(alarm)
+    return found
+
+
 def notes(trace: Trace) -> list[Note]:
     """What happened, in order of time: alarms, injected faults, meals, changes of the firmware's state."""
     found = [
@@ -95,9 +141,9 @@ def notes(trace: Trace) -> list[Note]:
             "ALARM",
             f"{alarm.node} {alarm.code} {'over' if alarm.state == 'Inactive' else alarm.state.lower()}"
             f" ({alarm.priority.lower()})",
-            GREY if alarm.state == "Inactive" else PRIORITY_COLOURS.get(alarm.priority, WHITE),
+            GREY if alarm.state == "Inactive" else PRIORITY_COLOURS.get(alarm.priority, GREY),
         )
-        for alarm in trace.alarms
+        for alarm in without_reminders(trace.alarms)
     ]
     for span in trace.fault_spans():
         minutes = round((span.end_s - span.start_s) / 60)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from can_bus.lockstep import STEP_SECONDS
-from pumpbench.story import GREEN, LANES, STATE_COLOURS, clock, state_changes, title
+from pumpbench.closeups import CloseUp
+from pumpbench.story import GREEN, LANES, STATE_COLOURS, alarm_spans, clock, state_changes, title
 from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
@@ -29,6 +30,9 @@ PRAM: Final = "#0b7a75"
 PRIORITY: Final = {"High": "#d62f2a", "Medium": "#e07b00", "Low": "#b79500", "Info": "#6b7280"}
 MAX_LINES: Final = 12
 """Alarm lines at the bottom of the picture; the rest is counted."""
+
+MAX_EVENTS: Final = 6
+"""Events told above a close-up."""
 
 MAX_LANES: Final = 5
 """Lanes of faults, and of alarms; what is left shares one more."""
@@ -53,13 +57,16 @@ class Lane(NamedTuple):
     bars: list[Bar]
 
 
-def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = None) -> None:
+def write_summary(
+    trace: Trace, path: Path, metrics: Mapping[str, Any] | None = None, closeup: CloseUp | None = None
+) -> None:
     """Draw a run into a PNG of 1600 x 1000 pixels.
 
     Args:
         trace: the decoded run.
         path: the picture; overwritten.
         metrics: content of metrics.json; without it the headline is computed from the trace.
+        closeup: draw only this part of the run.
 
     Raises:
         OSError: the file cannot be written.
@@ -67,9 +74,13 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
+    name, headline = title(trace.info), ""
+    if closeup is not None:
+        trace = trace.between(closeup.start_s, closeup.end_s)
+        name, headline = f"{closeup.name}   ({name})", _events(trace)
     dry = not any(np.nan_to_num(trace.get(name)).any() for name in ("PramRateCommanded", "PramDelivered"))
     dry = dry and not trace.get("PramBolusCommanded").any()
-    lanes = _lanes(trace)
+    lanes = lanes_of(trace)
     lines = _alarm_lines(trace)
     rows = (len(lines) + 2) // 3
     lane_height, text_height = 0.25 * len(lanes) + 0.1, 0.19 * rows + (0.25 if lines else 0.0)
@@ -79,8 +90,8 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
     shares = [0.55 * rest, 0.40 * rest, 0.05 * rest] if dry else [0.44 * rest, 0.30 * rest, 0.26 * rest]
     axes = figure.subplots(4, 1, sharex=True, height_ratios=[*shares, lane_height]).tolist()
     figure.subplots_adjust(left=0.094, right=0.838, top=0.925, bottom=(0.45 + text_height) / 10, hspace=0.09)
-    figure.text(0.094, 0.965, title(trace.info), fontsize=16, fontweight="bold", va="center")
-    figure.text(0.094, 0.94, _headline(trace, metrics), fontsize=11.5, va="center", color="#444444")
+    figure.text(0.094, 0.965, name, fontsize=16, fontweight="bold", va="center")
+    figure.text(0.094, 0.94, headline or _headline(trace, metrics), fontsize=11.5, va="center", color="#444444")
     end_s = max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
     start_s = float(trace.time_s[0]) if len(trace) else 0.0
     _glucose(axes[0], trace)
@@ -90,19 +101,46 @@ def write_summary(trace: Trace, path: Path, metrics: Mapping[str, Any] | None = 
         axes[2].text(0.5, 0.45, "no pramlintide in this run", transform=axes[2].transAxes, ha="center", va="center")
     else:
         _drug(axes[2], trace, "Pram", "µg", PRAM, end_s - start_s)
-    _draw_lanes(axes[3], lanes, end_s - start_s)
+    draw_lanes(axes[3], lanes, end_s - start_s)
     for axis in axes[:3]:
         for span in trace.fault_spans():
             axis.axvspan(span.start_s, span.end_s, color=FAULT, alpha=0.10, lw=0, zorder=0)
         axis.grid(axis="x", color="#e3e3e3", lw=0.8)
         axis.set_axisbelow(True)
-    _time_axis(axes[3], start_s, end_s)
+    if closeup is not None:
+        for span in trace.fault_spans():
+            axes[0].annotate(
+                f" {span.label}",
+                (span.start_s, 1),
+                xycoords=("data", "axes fraction"),
+                xytext=(0, -4),
+                textcoords="offset points",
+                va="top",
+                color=FAULT,
+                fontsize=10,
+                fontweight="bold",
+            )
+    time_axis(axes[3], start_s, end_s)
     if lines:
         _write_lines(figure, lines, rows, text_height)
     figure.savefig(path, dpi=100)
 
 
 # ------------------------------------------------------------------------------------------------------------ headline
+
+
+def _events(trace: Trace) -> str:
+    """What was wrong and what the firmware did, in a line: faults and changes of state with their times."""
+    events = [(span.start_s, f"{span.label} until {_hhmm(span.end_s)}") for span in trace.fault_spans()]
+    changes = [(time_s, f"firmware {state}") for time_s, state in state_changes(trace, "CtrlState", "CTRL_Status")]
+    events += [change for change in changes[1:] if not change[1].endswith(" ")]
+    shown = [f"{_hhmm(time_s)} {text}" for time_s, text in sorted(events)]
+    more = f"    and {len(shown) - MAX_EVENTS} more" if len(shown) > MAX_EVENTS else ""
+    return "    ".join(shown[:MAX_EVENTS]) + more
+
+
+def _hhmm(time_s: float) -> str:
+    return clock(time_s).split(" ")[1]
 
 
 def _headline(trace: Trace, metrics: Mapping[str, Any] | None) -> str:
@@ -168,7 +206,7 @@ def _glucose(axis: Any, trace: Trace) -> None:
     if trace.meals:
         axis.plot([], [], marker="^", ls="", color=_hex(GREEN), ms=7, label="meal")
     axis.set_ylabel("glucose [mg/dL]")
-    _legend(axis)
+    legend(axis)
 
 
 def _drug(axis: Any, trace: Trace, drug: str, unit: str, colour: str, span_s: float) -> None:
@@ -194,7 +232,7 @@ def _drug(axis: Any, trace: Trace, drug: str, unit: str, colour: str, span_s: fl
         other.tick_params(axis="y", colors=PLASMA, labelsize=8, pad=1)
         for held, more in zip(handles, other.get_legend_handles_labels(), strict=True):
             held.extend(more)
-    _legend(axis, handles, offset=1.033 if drug == "Pram" else 1.01)
+    legend(axis, handles, offset=1.033 if drug == "Pram" else 1.01)
 
 
 def _boluses(axis: Any, trace: Trace, drug: str, unit: str, colour: str, *, labelled: bool) -> float:
@@ -238,7 +276,7 @@ def _binned(time_s: Array, values: Array, every: int) -> tuple[Array, Array]:
     return edges, means
 
 
-def _legend(axis: Any, handles: Sequence[list[Any]] = (), offset: float = 1.01) -> None:
+def legend(axis: Any, handles: Sequence[list[Any]] = (), offset: float = 1.01) -> None:
     """Beside the plot, where it covers no data."""
     shown = handles or axis.get_legend_handles_labels()
     if shown[0]:
@@ -250,7 +288,8 @@ def _legend(axis: Any, handles: Sequence[list[Any]] = (), offset: float = 1.01) 
 # --------------------------------------------------------------------------------------------------------------- lanes
 
 
-def _lanes(trace: Trace) -> list[Lane]:
+def lanes_of(trace: Trace) -> list[Lane]:
+    """States of firmware, pump and sensor, injected faults and alarms as rows of bars."""
     end_s = float(trace.time_s[-1]) if len(trace) else 0.0
     lanes = []
     names = [lane for lane in LANES if lane[0] != "CtrlMode"]
@@ -286,23 +325,16 @@ def _lanes(trace: Trace) -> list[Lane]:
 
 def alarm_bars(trace: Trace, end_s: float) -> list[Bar]:
     """Each alarm from its first frame until it is over or, at the latest, until `end_s` (simulated seconds)."""
-    began: dict[tuple[str, int], tuple[float, str, str]] = {}
-    bars = []
-    for alarm in trace.alarms:
-        key = (alarm.node, alarm.instance)
-        if alarm.state == "Inactive":
-            if key in began:
-                start, code, priority = began.pop(key)
-                bars.append(Bar(start, alarm.time_s, code, PRIORITY.get(priority, "#6b7280")))
-        elif key not in began:
-            began[key] = (alarm.time_s, alarm.code, alarm.priority)
-    bars += [Bar(start, end_s, code, PRIORITY.get(priority, "#6b7280")) for start, code, priority in began.values()]
-    return sorted(bars)
+    return [
+        Bar(span.start_s, min(span.end_s, end_s), span.code, PRIORITY.get(span.priority, "#6b7280"))
+        for span in alarm_spans(trace)
+    ]
 
 
-def _draw_lanes(axis: Any, lanes: Sequence[Lane], span_s: float) -> None:
+def draw_lanes(axis: Any, lanes: Sequence[Lane], span_s: float) -> None:
+    """Draw rows of bars into an axis of `span_s` simulated seconds; a name that does not fit goes beside its bar."""
     axis.set_ylim(max(len(lanes), 1) - 0.45, -0.55)
-    axis.set_yticks(range(len(lanes)), [lane.name for lane in lanes], fontsize=8.5)
+    axis.set_yticks(range(len(lanes)), [lane.name for lane in lanes], fontsize=8)
     axis.tick_params(axis="y", length=0)
     for side in ("top", "right", "left"):
         axis.spines[side].set_visible(False)
@@ -360,12 +392,15 @@ def _hex(colour: tuple[int, int, int]) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
-def _time_axis(axis: Any, start_s: float, end_s: float) -> None:
+def time_axis(axis: Any, start_s: float, end_s: float) -> None:
+    """Label an axis of simulated seconds as people read time: hh:mm, days in long runs."""
     span = end_s - start_s
     axis.set_xlim(start_s - 0.004 * span, end_s + 0.004 * span)
     if span <= 1.5 * HOUR:
         step = 600.0
-    elif span <= 8 * HOUR:
+    elif span <= 5 * HOUR:
+        step = HOUR / 2
+    elif span <= 9 * HOUR:
         step = HOUR
     elif span <= 1.5 * DAY:
         step = 2 * HOUR

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from can_bus import codec
+from can_bus.frame import CAN_EFF_FLAG, CAN_RTR_FLAG
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench.capture import Frames
+from pumpbench.closeups import close_ups
 from pumpbench.story import (
     BLUE,
     GREEN,
@@ -27,11 +29,11 @@ from pumpbench.story import (
     RED,
     STATE_COLOURS,
     TEAL,
-    WHITE,
     YELLOW,
     hue,
     notes,
     state_changes,
+    without_reminders,
 )
 from pumpbench.trace import Trace, decode, signals
 
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
     Array = NDArray[Any]
 
 TIMELINE: Final = "sim_time"
+BIT_RATE: Final = 500_000
+"""Bits a second, to tell how long a step's frames would take on a real bus."""
 
 
 def log_run(recording: Any, trace: Trace, frames: Frames, metrics: Mapping[str, Any] | None = None) -> None:
@@ -74,6 +78,8 @@ class _Logger:
         self.lanes(trace, end_s)
         self.log(trace)
         self.bus(trace, frames)
+        for number, closeup in enumerate(close_ups(trace), 1):
+            self.document(f"closeup/{number}", closeup.text(trace))
 
     def send(self, path: str, time_s: Array, columns: Any) -> None:
         self.recording.send_columns(path, indexes=[self.rr.TimeColumn(TIMELINE, duration=time_s)], columns=columns)
@@ -129,7 +135,10 @@ class _Logger:
             if content
         ]
         if parts:
-            self.recording.log("run", self.rr.TextDocument("\n".join(parts), media_type="text/markdown"), static=True)
+            self.document("run", "\n".join(parts))
+
+    def document(self, path: str, markdown: str) -> None:
+        self.recording.log(path, self.rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def glucose(self, trace: Trace, end_s: float) -> None:
         for limit, colour in ((70.0, RED), (180.0, ORANGE)):
@@ -137,8 +146,8 @@ class _Logger:
             self.send(path, np.array([0.0, end_s]), self.rr.Scalars.columns(scalars=np.full(2, limit)))
             style = self.rr.SeriesLines(names=f"limit {limit:.0f}", colors=[colour], widths=[1.0])
             self.recording.log(path, style, static=True)
-        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", WHITE)
-        self.line("glucose/interstitial", trace, trace.get("TruthInterstitial"), "interstitial", GREY, 1.0)
+        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", GREY, 2.5)
+        self.line("glucose/interstitial", trace, trace.get("TruthInterstitial"), "interstitial", PURPLE, 0.8)
         self.points("glucose/cgm", trace.time_s, trace.get("GlucoseConc"), "CGM", BLUE)
         meals = np.array([meal.time_s for meal in trace.meals])
         self.points("glucose/meal", meals, np.full(len(meals), 48.0), "meal (see log)", GREEN, "up", 5.0)
@@ -160,7 +169,7 @@ class _Logger:
     def stomach(self, trace: Trace) -> None:
         self.line("stomach/eta", trace, trace.get("TruthEta") * 100, "emptying η [%]", PINK)
         self.line("stomach/content", trace, trace.get("TruthQsto") / 1000, "content [g]", GREEN)
-        self.line("stomach/appearance", trace, trace.get("TruthRa") * 10, "Ra [0.1 mg/kg/min]", GREY, 1.0)
+        self.line("stomach/appearance", trace, trace.get("TruthRa"), "Ra [mg/kg/min]", ORANGE)
 
     def lanes(self, trace: Trace, end_s: float) -> None:
         lanes = [lane for lane in LANES if lane[0] in trace.columns]
@@ -183,7 +192,7 @@ class _Logger:
         lanes: dict[str, list[tuple[float, str]]] = {}
         standing: dict[str, set[int]] = {}
         tints: dict[str, dict[str, tuple[int, int, int]]] = {}
-        for alarm in trace.alarms:
+        for alarm in without_reminders(trace.alarms):
             lane = f"alarm/{alarm.code}_{alarm.node}"
             instances = standing.setdefault(lane, set())
             if alarm.state == "Inactive":
@@ -226,25 +235,43 @@ class _Logger:
 
     def bus(self, trace: Trace, frames: Frames) -> None:
         names = {0: "device", 1: "plant"}
-        first = int(trace.step[0]) if len(trace) else 0
         for channel in sorted(set(frames.channel.tolist())):
-            rows = frames.channel == channel
-            for path, what, mask, colour in (
-                ("frames", "frames/step", rows, GREEN if channel == 0 else GREY),
-                ("refused", "damaged", rows & ~frames.intact, RED),
-            ):
-                count = np.bincount(frames.step[mask] - first, minlength=len(trace)).astype(float)
-                if path == "frames" or count.any():
-                    label = f"{what}, {names.get(channel, channel)}"
-                    self.line(f"bus/{path}_{channel}", trace, count, label, colour, step=True)
-            self.table(f"can/can{channel}", frames.select(np.flatnonzero(rows)))
+            of = names.get(channel, str(channel))
+            colour, width = (GREEN, 3.5) if channel == 0 else (GREY, 1.2)  # the same most of the time
+            heard = frames.select(np.flatnonzero(frames.channel == channel))
+            count = per_step(trace, heard.step)
+            self.line(f"bus/frames/{channel}", trace, count, f"frames, {of}", colour, width, step=True)
+            busy = per_step(trace, heard.step, 1000 * wire_bits(heard) / BIT_RATE)
+            self.line(f"bus/load/{channel}", trace, busy, f"ms, {of}", colour, width, step=True)
+            refused = per_step(trace, heard.step[~heard.intact])
+            if refused.any():
+                self.line(f"bus/errors/refused_{channel}", trace, refused, f"damaged frames, {of}", RED, step=True)
+            self.rates(channel, trace, heard)
+            self.table(f"can/can{channel}", heard)
         for signal, what, colour in (
             ("LostFrameCount", "lost", ORANGE),
             ("E2eErrorCount", "checksum errors", RED),
             ("SequenceErrorCount", "out of sequence", PURPLE),
             ("SaturationCount", "saturations", YELLOW),
         ):
-            self.line(f"bus/{signal}", trace, trace.get(signal), what, colour, step=True)
+            self.line(f"bus/errors/{signal}", trace, trace.get(signal), what, colour, step=True)
+
+    def rates(self, channel: int, trace: Trace, frames: Frames) -> None:
+        """A lane for each message: how many of it a step brought, in orange if not the usual number.
+
+        The cyclic ones come first: a gap in such a lane is a frame that is missing.
+        """
+        for message in codec.messages().values():
+            counts = per_step(trace, frames.step[frames.can_id == message.can_id])
+            if not counts.any():
+                continue
+            usual = np.median(counts)
+            starts = np.flatnonzero(np.append(True, counts[1:] != counts[:-1]))
+            changes = [(float(trace.time_s[row]), f"{counts[row]:.0f}" if counts[row] else "") for row in starts]
+            colours = {
+                f"{count:.0f}": BLUE if not usual else GREEN if count == usual else ORANGE for count in set(counts)
+            }
+            self.states(f"rate/can{channel}/{1 if usual else 2}_{message.name}", changes, colours)
 
     def table(self, path: str, frames: Frames) -> None:
         """Every frame of a bus as a row: id, name and bytes, and a line of text with the decoded values."""
@@ -269,6 +296,20 @@ class _Logger:
                 *self.rr.AnyValues.columns(id=texts, data=payloads, step=frames.step.astype("i8")),
             ],
         )
+
+
+def per_step(trace: Trace, step: Array, weight: Array | None = None) -> Array:
+    """The sum of something over each step of a trace: of frames, if no `weight` is given."""
+    first = int(trace.step[0]) if len(trace) else 0
+    return np.bincount(step - first, weight, minlength=len(trace)).astype(float)
+
+
+def wire_bits(frames: Frames) -> Array:
+    """Bits that each frame takes on the wire at most, with the stuff bits of the worst case and the gap behind it."""
+    extended, remote = (frames.can_id & flag != 0 for flag in (CAN_EFF_FLAG, CAN_RTR_FLAG))
+    stuffed = np.where(extended, 54, 34) + 8 * np.where(remote, 0, frames.length.astype("i8"))
+    bits: Array = stuffed + (stuffed - 1) // 4 + 13  # CRC delimiter, acknowledgement, end of frame and gap are never stuffed
+    return bits
 
 
 def describe(frames: Frames) -> list[str]:

@@ -1,24 +1,29 @@
-"""A picture of a recording on a machine without a display.
+"""Pictures of a recording on a machine without a display.
 
-Rerun's own viewer draws it off-screen when there is a Vulkan driver (Mesa's lavapipe will do: `apt-get install
-mesa-vulkan-drivers`); otherwise Matplotlib draws the run's summary from the trace beside the recording.
+Rerun's own viewer draws them off-screen when there is a Vulkan driver (Mesa's lavapipe will do: `apt-get install
+mesa-vulkan-drivers`, or `tools/with_browser -- COMMAND`); otherwise Matplotlib draws the same from the run's folder.
 """
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from pumpbench.files import write_file
 from pumpbench.recording.columns import TIMELINE
-from pumpbench.recording.file import APPLICATION
-from pumpbench.recording.layout import blueprint
+from pumpbench.recording.scene import Scene, scene_of
+from pumpbench.recording.still import draw_still
 from pumpbench.recording.tool import quiet_environment, rerun_binary
-from pumpbench.summary import write_summary
-from pumpbench.trace import Trace
+
+if TYPE_CHECKING:
+    from pumpbench.recording.layout import Blueprint
 
 SETTLE_SECONDS: Final = 1.0
 """Wall time the viewer gets after loading: tables find their column widths while it draws."""
@@ -28,136 +33,157 @@ class NoViewer(RuntimeError):
     """Rerun's viewer cannot draw here; the text says why."""
 
 
-def snapshot(
-    rrd_path: Path,
-    png_path: Path,
-    *,
-    size: tuple[int, int] = (1600, 1000),
-    view: str | None = None,
-    window: tuple[float, float] | None = None,
-    timeout: float = 60,
-) -> str:
-    """Draw a recording into a PNG.
+@dataclass(frozen=True)
+class Shot:
+    """A picture to be taken.
+
+    Attributes:
+        path: the PNG; overwritten.
+        layout: the tab: day, bus, patient, or the name of a close-up.
+        window: simulated seconds from, to; the whole run, or the close-up's own, when left out.
+        view: name of one view of that tab, to draw nothing else.
+    """
+
+    path: Path
+    layout: str = "day"
+    window: tuple[float, float] | None = None
+    view: str | None = None
+
+
+def close_up_shots(scene: Scene, folder: Path) -> list[Shot]:
+    """A picture of each close-up of a run, named after what happened in it."""
+    return [
+        Shot(folder / f"fault-{number}-{closeup.slug}.png", closeup.name)
+        for number, closeup in enumerate(scene.close_ups, 1)
+    ]
+
+
+def snapshot(rrd: Path, shots: list[Shot], *, size: tuple[int, int] = (1600, 1000), timeout: float = 60) -> str:
+    """Draw pictures of a recording.
 
     Args:
-        rrd_path: the recording; for the fallback its folder also holds the trace.
-        png_path: the picture; overwritten.
-        size: width and height of the viewer's window in pixels.
-        view: name of one view to draw instead of the whole window.
-        window: simulated seconds from, to; the whole run when left out.
-        timeout: seconds of wall clock for the viewer.
+        rrd: the recording; for Matplotlib its folder also holds the rest of the run.
+        shots: the pictures.
+        size: width and height of the viewer's window in pixels; Matplotlib's are 1600 x 1000.
+        timeout: seconds of wall clock for the viewer to start and load.
 
     Returns:
-        How it was drawn, in words, and what the viewer could not show.
+        How they were drawn, in words, and what the viewer could not show.
 
     Raises:
-        FileNotFoundError: no such recording, or neither a viewer nor a trace to draw from.
-        ValueError: no view of that name.
+        OSError: no such recording, or neither a viewer nor a run to draw from, or a picture cannot be written.
+        NoViewer: a single view is asked for, which only Rerun's viewer can draw, and it cannot.
+        ValueError: the recording is none of ours, or there is no such layout or view.
     """
-    if not rrd_path.is_file():
-        raise FileNotFoundError(f"{rrd_path} is missing")
+    from pumpbench.recording.layout import blueprint  # noqa: PLC0415
+
+    if not rrd.is_file():
+        raise FileNotFoundError(f"{rrd} is missing")
+    scene = scene_of(rrd)
+    looks = [blueprint(scene, shot.layout, shot.window, shot.view) for shot in shots]
+    complaints: list[str] = []
     try:
-        complaints = _draw(rrd_path.resolve(), png_path.resolve(), size, view, window, timeout)
+        with _viewer(rrd.resolve(), size, timeout) as viewer:
+            for shot, look in zip(shots, looks, strict=True):
+                closeups = {each.name: each.start_s for each in scene.close_ups}
+                cursor_s = shot.window[0] if shot.window else closeups.get(shot.layout, scene.start_s)
+                picture, said = viewer.draw(look, cursor_s)
+                write_file(shot.path, picture)
+                complaints += said
     except NoViewer as error:
-        trace = Trace.load(rrd_path.parent)
-        write_summary(trace if window is None else trace.between(*window), png_path)
+        for shot in shots:
+            if shot.view is not None:
+                raise
+            draw_still(rrd.parent, scene, shot.path, shot.layout, shot.window)
         return f"drawn by Matplotlib, because Rerun's viewer cannot draw here: {error}"
     return "; ".join(["drawn by Rerun's viewer, off-screen", *complaints])
 
 
-def _draw(
-    rrd: Path,
-    png: Path,
-    size: tuple[int, int],
-    view: str | None,
-    window: tuple[float, float] | None,
-    timeout: float,
-) -> list[str]:
-    deadline = time.monotonic() + timeout
-    port = _free_port()
-    with tempfile.TemporaryDirectory() as scratch:
+class _Viewer:
+    """A viewer without a window, and the recording it has loaded."""
+
+    def __init__(self, process: subprocess.Popen[bytes], errors: Path, deadline: float) -> None:
+        self._process, self._errors, self._deadline = process, errors, deadline
+        self._client: Any = None
+
+    def connect(self, port: int) -> None:
+        """Wait until it answers and the recording is loaded."""
+        try:
+            from rerun.experimental import ViewerClient  # noqa: PLC0415
+        except ImportError as error:
+            raise NoViewer(f"this version of rerun-sdk has no ViewerClient: {error}") from error
+        while True:
+            self._check()
+            try:
+                with socket.create_connection(("127.0.0.1", port), timeout=1):
+                    pass
+                self._client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+                state = self._client.get_state()
+                if state.active_recording and not state.loading and state.views:
+                    return
+            except (OSError, RuntimeError):
+                pass
+            time.sleep(0.05)
+
+    def draw(self, look: Blueprint, cursor_s: float) -> tuple[bytes, list[str]]:
+        """A PNG of the window with these looks, and what their views complain about."""
+        from pumpbench.recording.layout import views  # noqa: PLC0415
+
+        wanted = {str(view.id) for view in views(look.root_container)}
+        try:
+            # the viewer has given the application of a file a name of its own: Recording:NAME:id
+            application = self._client.get_state().active_recording.split(":")[1]
+            look.connect_grpc(application, url=self._client.url, make_default=False)
+            while {view.view_id for view in self._client.get_state().views} != wanted:
+                self._check()
+                time.sleep(0.05)
+            self._client.set_time(TIMELINE, duration=cursor_s)  # the tables scroll there
+            time.sleep(SETTLE_SECONDS)
+            picture: bytes = self._client.take_screenshot()
+            shown = self._client.get_state().views
+        except (RuntimeError, ConnectionError) as error:
+            raise NoViewer(f"it took no screenshot: {error}") from error
+        return picture, [f"view {view.name}: {report.summary}" for view in shown for report in view.reports]
+
+    def _check(self) -> None:
+        if self._process.poll() is not None:
+            text = self._errors.read_text(errors="replace")
+            lines = [line.strip() for line in text.splitlines() if "panicked" in line or "adapter" in line]
+            reason = lines[0] if lines else (text.strip().splitlines() or ["no message"])[-1]
+            raise NoViewer(f"it ended with status {self._process.returncode}: {reason}")
+        if time.monotonic() > self._deadline:
+            raise NoViewer("it did not show the recording in time")
+
+
+@contextlib.contextmanager
+def _viewer(rrd: Path, size: tuple[int, int], timeout: float) -> Iterator[_Viewer]:
+    port = free_port()
+    with tempfile.TemporaryDirectory() as directory:
+        scratch = Path(directory)
+        errors = scratch / "stderr"
         arguments = ["--headless", "--port", str(port), "--bind", "127.0.0.1", "--memory-limit", "2GB"]
-        files = [str(rrd)]
-        if window is not None:
-            layout = Path(scratch) / "window.rbl"
-            blueprint(*window, gateway=True).save(APPLICATION, layout)
-            files.append(str(layout))
-        errors = Path(scratch) / "stderr"
         with errors.open("wb") as sink:
-            viewer = subprocess.Popen(
-                [rerun_binary(), *arguments, "--window-size", f"{size[0]}x{size[1]}", *files],
-                env=quiet_environment(Path(scratch)),
+            process = subprocess.Popen(
+                [rerun_binary(), *arguments, "--window-size", f"{size[0]}x{size[1]}", str(rrd)],
+                env=quiet_environment(scratch),
                 stdout=subprocess.DEVNULL,
                 stderr=sink,
             )
         try:
-            client = _connect(viewer, port, errors, deadline)
-            state = _loaded(client, viewer, errors, deadline)
-            chosen = None
-            if view is not None:
-                chosen = next((shown.view_id for shown in state.views if shown.name == view), None)
-                if chosen is None:
-                    raise ValueError(f"no view {view!r}; there are {', '.join(shown.name for shown in state.views)}")
-            if window is not None:
-                client.set_time(TIMELINE, duration=window[0])  # the tables scroll there
-            time.sleep(SETTLE_SECONDS)
-            try:
-                png.write_bytes(client.take_screenshot(chosen))
-                views = client.get_state().views
-                return [f"view {shown.name}: {report.summary}" for shown in views for report in shown.reports]
-            except (RuntimeError, ConnectionError) as error:
-                raise NoViewer(f"it took no screenshot: {error}") from error
+            viewer = _Viewer(process, errors, time.monotonic() + timeout)
+            viewer.connect(port)
+            yield viewer
         finally:
-            viewer.terminate()
+            process.terminate()
             try:
-                viewer.wait(5)
+                process.wait(5)
             except subprocess.TimeoutExpired:
-                viewer.kill()
-                viewer.wait()
+                process.kill()
+                process.wait()
 
 
-def _connect(viewer: subprocess.Popen[bytes], port: int, errors: Path, deadline: float) -> Any:
-    try:
-        from rerun.experimental import ViewerClient  # noqa: PLC0415
-    except ImportError as error:
-        raise NoViewer(f"this version of rerun-sdk has no ViewerClient: {error}") from error
-    while True:
-        _check(viewer, errors, deadline)
-        try:
-            with socket.create_connection(("127.0.0.1", port), timeout=1):
-                pass
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            client.get_state()
-            return client
-        except (OSError, RuntimeError):
-            time.sleep(0.05)
-
-
-def _loaded(client: Any, viewer: subprocess.Popen[bytes], errors: Path, deadline: float) -> Any:
-    """The viewer's state once the recording and its blueprint are there."""
-    while True:
-        _check(viewer, errors, deadline)
-        try:
-            state = client.get_state()
-        except (RuntimeError, ConnectionError):
-            time.sleep(0.05)
-            continue
-        if state.active_recording and not state.loading and state.views:
-            return state
-        time.sleep(0.05)
-
-
-def _check(viewer: subprocess.Popen[bytes], errors: Path, deadline: float) -> None:
-    if viewer.poll() is not None:
-        text = errors.read_text(errors="replace")
-        lines = [line.strip() for line in text.splitlines() if "graphics" in line or "adapter" in line]
-        reason = lines[-1] if lines else (text.strip().splitlines() or ["no message"])[-1]
-        raise NoViewer(f"it ended with status {viewer.returncode}: {reason}")
-    if time.monotonic() > deadline:
-        raise NoViewer("it did not show the recording in time")
-
-
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
