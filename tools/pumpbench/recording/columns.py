@@ -308,7 +308,8 @@ def wire_bits(frames: Frames) -> Array:
     """Bits that each frame takes on the wire at most, with the stuff bits of the worst case and the gap behind it."""
     extended, remote = (frames.can_id & flag != 0 for flag in (CAN_EFF_FLAG, CAN_RTR_FLAG))
     stuffed = np.where(extended, 54, 34) + 8 * np.where(remote, 0, frames.length.astype("i8"))
-    bits: Array = stuffed + (stuffed - 1) // 4 + 13  # CRC delimiter, acknowledgement, end of frame and gap are never stuffed
+    unstuffed = 13  # the delimiters of CRC and acknowledgement, the acknowledgement, end of frame and gap
+    bits: Array = stuffed + (stuffed - 1) // 4 + unstuffed
     return bits
 
 
