@@ -13,6 +13,7 @@ from pumpbench import __version__
 from pumpbench.cli_conformance import conformance
 from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
+from pumpbench.cli_view import snapshot, view
 from pumpbench.terminal import (
     EXIT_DEAD,
     EXIT_INTERRUPTED,
@@ -473,6 +474,8 @@ app.command()(matrix)
 app.command()(hunt)
 app.command()(conformance)
 app.command()(doctor)
+app.command()(view)
+app.command()(snapshot)
 
 
 class Interrupted(Exception):
@@ -499,6 +502,11 @@ def main() -> None:
 
 def _status(error: Exception) -> int | None:
     """The exit status of an error, None for one that is our own mistake and deserves its traceback."""
+    if isinstance(error, Failed):
+        return error.status
+    if isinstance(error, Interrupted):
+        return EXIT_INTERRUPTED
+
     import can  # noqa: PLC0415
 
     from can_bus.codec import CodecError  # noqa: PLC0415
@@ -515,17 +523,16 @@ def _status(error: Exception) -> int | None:
     from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
     from pumpbench.convert import ConvertError  # noqa: PLC0415
     from pumpbench.hunt import HuntError  # noqa: PLC0415
+    from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
 
-    if isinstance(error, Failed):
-        return error.status
-    if isinstance(error, Interrupted):
-        return EXIT_INTERRUPTED
     wrong = (
         CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
     )
-    wrong |= CalibrationError | ControllerModelError | ConvertError | HuntError | RigError | RunFolderError
+    wrong |= (
+        CalibrationError | ControllerModelError | ConvertError | HuntError | RecordingError | RigError | RunFolderError
+    )
     if isinstance(error, wrong):
         return EXIT_USAGE
     if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):

@@ -28,7 +28,7 @@ LEGEND_SHARE: Final = 0.17
 
 
 class LayoutError(ValueError):
-    """There is no such tab or view; the text names those there are."""
+    """A tab or view that there is not; the text names those there are."""
 
 
 class Blueprint(rrb.Blueprint):  # type: ignore[misc]
@@ -58,11 +58,13 @@ def blueprint(scene: Scene, layout: str = "day", window: Window | None = None, v
         view: name of the one view of that tab to be shown, and nothing else.
 
     Raises:
-        LayoutError: there is no such tab or view.
+        LayoutError: there is no such tab or view, or a close-up is given another window.
     """
     names = [*LAYOUTS, *(closeup.name for closeup in scene.close_ups)]
     if layout not in names:
         raise LayoutError(f"no layout {layout!r}; there are {', '.join(names)}")
+    if layout not in LAYOUTS and window is not None:
+        raise LayoutError(f"{layout!r} has a window of its own; the others are {', '.join(LAYOUTS)}")
     tabs = [day(scene), bus(scene), patient(scene)]
     tabs += [close_up(scene, closeup, number) for number, closeup in enumerate(scene.close_ups, 1)]
     chosen = names.index(layout)

@@ -20,7 +20,7 @@ from pumpbench.files import write_file
 from pumpbench.recording.columns import TIMELINE
 from pumpbench.recording.scene import Scene, scene_of
 from pumpbench.recording.still import draw_still
-from pumpbench.recording.tool import quiet_environment, rerun_binary
+from pumpbench.recording.tool import free_port, last_words, viewer
 
 if TYPE_CHECKING:
     from pumpbench.recording.layout import Blueprint
@@ -58,12 +58,20 @@ def close_up_shots(scene: Scene, folder: Path) -> list[Shot]:
     ]
 
 
-def snapshot(rrd: Path, shots: list[Shot], *, size: tuple[int, int] = (1600, 1000), timeout: float = 60) -> str:
+def snapshot(
+    rrd: Path,
+    shots: list[Shot],
+    *,
+    run: Path | None = None,
+    size: tuple[int, int] = (1600, 1000),
+    timeout: float = 60,
+) -> str:
     """Draw pictures of a recording.
 
     Args:
-        rrd: the recording; for Matplotlib its folder also holds the rest of the run.
+        rrd: the recording.
         shots: the pictures.
+        run: the run folder, for Matplotlib; that of the recording when left out.
         size: width and height of the viewer's window in pixels; Matplotlib's are 1600 x 1000.
         timeout: seconds of wall clock for the viewer to start and load.
 
@@ -83,18 +91,18 @@ def snapshot(rrd: Path, shots: list[Shot], *, size: tuple[int, int] = (1600, 100
     looks = [blueprint(scene, shot.layout, shot.window, shot.view) for shot in shots]
     complaints: list[str] = []
     try:
-        with _viewer(rrd.resolve(), size, timeout) as viewer:
+        with _loaded(rrd.resolve(), size, timeout) as drawing:
             for shot, look in zip(shots, looks, strict=True):
                 closeups = {each.name: each.start_s for each in scene.close_ups}
                 cursor_s = shot.window[0] if shot.window else closeups.get(shot.layout, scene.start_s)
-                picture, said = viewer.draw(look, cursor_s)
+                picture, said = drawing.draw(look, cursor_s)
                 write_file(shot.path, picture)
                 complaints += said
     except NoViewer as error:
         for shot in shots:
             if shot.view is not None:
                 raise
-            draw_still(rrd.parent, scene, shot.path, shot.layout, shot.window)
+            draw_still(run or rrd.parent, scene, shot.path, shot.layout, shot.window)
         return f"drawn by Matplotlib, because Rerun's viewer cannot draw here: {error}"
     return "; ".join(["drawn by Rerun's viewer, off-screen", *complaints])
 
@@ -102,8 +110,8 @@ def snapshot(rrd: Path, shots: list[Shot], *, size: tuple[int, int] = (1600, 100
 class _Viewer:
     """A viewer without a window, and the recording it has loaded."""
 
-    def __init__(self, process: subprocess.Popen[bytes], errors: Path, deadline: float) -> None:
-        self._process, self._errors, self._deadline = process, errors, deadline
+    def __init__(self, process: subprocess.Popen[bytes], scratch: Path, deadline: float) -> None:
+        self._process, self._scratch, self._deadline = process, scratch, deadline
         self._client: Any = None
 
     def connect(self, port: int) -> None:
@@ -147,44 +155,17 @@ class _Viewer:
 
     def _check(self) -> None:
         if self._process.poll() is not None:
-            text = self._errors.read_text(errors="replace")
-            lines = [line.strip() for line in text.splitlines() if "panicked" in line or "adapter" in line]
-            reason = lines[0] if lines else (text.strip().splitlines() or ["no message"])[-1]
-            raise NoViewer(f"it ended with status {self._process.returncode}: {reason}")
+            raise NoViewer(f"it ended with status {self._process.returncode}: {last_words(self._scratch)}")
         if time.monotonic() > self._deadline:
             raise NoViewer("it did not show the recording in time")
 
 
 @contextlib.contextmanager
-def _viewer(rrd: Path, size: tuple[int, int], timeout: float) -> Iterator[_Viewer]:
+def _loaded(rrd: Path, size: tuple[int, int], timeout: float) -> Iterator[_Viewer]:
     port = free_port()
-    with tempfile.TemporaryDirectory() as directory:
-        scratch = Path(directory)
-        errors = scratch / "stderr"
-        arguments = ["--headless", "--port", str(port), "--bind", "127.0.0.1", "--memory-limit", "2GB"]
-        with errors.open("wb") as sink:
-            process = subprocess.Popen(
-                [rerun_binary(), *arguments, "--window-size", f"{size[0]}x{size[1]}", str(rrd)],
-                env=quiet_environment(scratch),
-                stdout=subprocess.DEVNULL,
-                stderr=sink,
-            )
-        try:
-            viewer = _Viewer(process, errors, time.monotonic() + timeout)
-            viewer.connect(port)
-            yield viewer
-        finally:
-            process.terminate()
-            try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def free_port() -> int:
-    """A port of this machine that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    arguments = ["--headless", "--port", str(port), "--bind", "127.0.0.1", "--memory-limit", "2GB"]
+    arguments += ["--window-size", f"{size[0]}x{size[1]}", str(rrd)]
+    with tempfile.TemporaryDirectory() as scratch, viewer(arguments, Path(scratch)) as process:
+        drawing = _Viewer(process, Path(scratch), time.monotonic() + timeout)
+        drawing.connect(port)
+        yield drawing

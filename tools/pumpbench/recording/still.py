@@ -60,6 +60,7 @@ def draw_still(folder: Path, scene: Scene, png: Path, layout: str, window: tuple
     Raises:
         OSError: a file of the run is missing or cannot be read.
     """
+    png.parent.mkdir(parents=True, exist_ok=True)
     run = RunFolder(folder)
     trace = run.trace
     closeup = next((each for each in scene.close_ups if each.name == layout), None)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import socket
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -43,3 +46,39 @@ def rrd(arguments: list[str], environment: dict[str, str]) -> None:
     if result.returncode:
         lines = (result.stderr or result.stdout).strip().splitlines() or ["no message"]
         raise RecordingError(f"rerun rrd {arguments[0]} failed: {lines[-1]}")
+
+
+@contextlib.contextmanager
+def viewer(arguments: list[str], scratch: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """The viewer's process, which does not outlive this; `last_words(scratch)` has what it complained about."""
+    with (scratch / "stderr").open("wb") as sink:
+        process = subprocess.Popen(
+            [rerun_binary(), *arguments], env=quiet_environment(scratch), stdout=subprocess.DEVNULL, stderr=sink
+        )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(5)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def last_words(scratch: Path) -> str:
+    """Why the viewer ended, in a line."""
+    lines = [line.strip() for line in (scratch / "stderr").read_text(errors="replace").splitlines() if line.strip()]
+    telling = [line for line in lines if "panicked" in line or line.startswith("Error")]
+    return (telling or lines[-1:] or ["no message"])[0]
+
+
+def free_port(preferred: int = 0) -> int:
+    """A port of this machine that nobody listens on, the preferred one if that is so."""
+    for port in (preferred, 0):
+        with contextlib.suppress(OSError), socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("127.0.0.1", port))
+            found: int = probe.getsockname()[1]
+            return found
+    raise RecordingError("no port of 127.0.0.1 is free")
