@@ -43,10 +43,10 @@ class CloseUp:
     start_s: float
     end_s: float
 
-    @property
-    def slug(self) -> str:
-        """The name as a part of a file's name."""
-        return re.sub(r"[^A-Za-z0-9_]+", "-", self.name.replace(":", "")).strip("-")
+    def file_name(self, number: int) -> str:
+        """Name of its picture, the close-up being the `number`th of its run."""
+        slug = re.sub(r"[^A-Za-z0-9_]+", "-", self.name.replace(":", "")).strip("-")
+        return f"fault-{number}-{slug}.png"
 
     def text(self, trace: Trace) -> str:
         """What happened in it, as a table in Markdown."""

@@ -10,8 +10,9 @@ the ini file) say what is tested: nothing given, the reference firmware in this 
 
 from __future__ import annotations
 
+import html
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ import pytest
 
 if TYPE_CHECKING:
     from pumpbench.bench import Outcome
+    from pumpbench.closeups import CloseUp
 
 SETTINGS = {
     "bus": ("inproc", "the bus of every run that names none: inproc, hub, socketcan:vcan0, slcan:/dev/ttyACM0@500000"),
@@ -26,6 +28,9 @@ SETTINGS = {
     "firmware": ("", 'command that starts the firmware; "{bus}" becomes the URL of its bus, "{nvm}" a file'),
     "out": ("pumpbench-failed", "folder for the recordings of failed tests"),
 }
+
+SUMMARY = "summary.md"
+"""What the failed tests of a session were about, in the folder of their recordings."""
 
 _RUNS: pytest.StashKey[list[Outcome]] = pytest.StashKey()
 
@@ -77,19 +82,30 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Bench:
     return Bench(request.config, tmp_path, runs)
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """What an earlier session told of its failed tests is not to be taken for this one's."""
+    if not hasattr(session.config, "workerinput"):  # of pytest-xdist's processes, the one that starts the others
+        page = Path(_setting(session.config, "out")) / SUMMARY
+        if page.is_file():
+            page.unlink()
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
     """A failed test keeps its runs, and says of each what went wrong first."""
     report = yield
-    if call.when == "call" and report.failed:
+    if call.when == "call" and report.failed and call.excinfo is not None:
         runs: list[Outcome] = item.stash.get(_RUNS, [])
         for number, outcome in enumerate(runs):
-            report.sections.append((f"pumpbench run {number}", _account(item, outcome, number)))
+            account = _account(item, outcome, number, call.excinfo.exconly())
+            report.sections.append((f"pumpbench run {number}", account))
     return report
 
 
-def _account(item: pytest.Item, outcome: Outcome, number: int) -> str:
-    """Keep the run, and tell of it."""
+def _account(item: pytest.Item, outcome: Outcome, number: int, reason: str) -> str:
+    """Keep the run with its pictures, and tell of it."""
+    from pumpbench.summary import write_close_ups  # noqa: PLC0415
+
     name = item.nodeid.replace("/", "-").replace("::", "-").replace(":", "-")
     folder = (Path(_setting(item.config, "out")) / f"{name}-{number}").absolute()
     try:
@@ -99,7 +115,23 @@ def _account(item: pytest.Item, outcome: Outcome, number: int) -> str:
             shutil.rmtree(folder, ignore_errors=True)
             folder.parent.mkdir(parents=True, exist_ok=True)
             shutil.copytree(outcome.folder, folder)
-        kept = f"recording: {folder / 'recording.rrd'}\npicture:   {folder / 'summary.png'}"
+        closeups = write_close_ups(outcome.trace, folder)
+        with (folder.parent / SUMMARY).open("a", encoding="utf-8") as file:
+            file.write(_markdown(f"{item.nodeid}, run {number}", reason, outcome, folder, closeups))
+        pictures = [folder / "summary.png", *(path for _, path in closeups)]
+        kept = f"recording: {folder / 'recording.rrd'}\n" + "\n".join(f"picture:   {path}" for path in pictures)
     except OSError as error:  # a full disk must not hide what the test found
         kept = f"the run could not be kept: {error}"
     return f"{outcome.title}\n{outcome.story()}\n{kept}\n"
+
+
+def _markdown(name: str, reason: str, outcome: Outcome, folder: Path, closeups: Iterable[tuple[CloseUp, Path]]) -> str:
+    """A section of the page that CI shows. It has no pictures: GitHub renders none that are not on a server."""
+    fence = "`" * 4  # a message may quote three
+    parts = [f"### {name}", f"{fence}\n{reason}\n{fence}", outcome.title, f"{fence}\n{outcome.story()}\n{fence}"]
+    parts.append(f"Kept: `{folder.name}/recording.rrd`, `{folder.name}/summary.png`.")
+    for number, (closeup, path) in enumerate(closeups, 1):
+        look = f"`{folder.name}/{path.name}`, or `pumpbench view {folder.name} --fault {number}`"
+        parts.append(f"<details><summary>{html.escape(closeup.name)}</summary>\n\n{look}\n")
+        parts.append(f"{closeup.text(outcome.trace)}\n</details>")
+    return "\n\n".join(parts) + "\n\n"

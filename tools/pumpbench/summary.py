@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from can_bus.lockstep import STEP_SECONDS
-from pumpbench.closeups import CloseUp
+from pumpbench.closeups import CloseUp, close_ups
 from pumpbench.story import GREEN, LANES, STATE_COLOURS, alarm_spans, clock, state_changes, title
 from pumpbench.trace import Trace
 
@@ -124,6 +124,22 @@ def write_summary(
     if lines:
         _write_lines(figure, lines, rows, text_height)
     figure.savefig(path, dpi=100)
+
+
+def write_close_ups(trace: Trace, folder: Path) -> list[tuple[CloseUp, Path]]:
+    """Draw each close-up of a run into a PNG of its own.
+
+    Args:
+        trace: the whole run.
+        folder: where the pictures go; it exists.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    drawn = [(closeup, folder / closeup.file_name(number)) for number, closeup in enumerate(close_ups(trace), 1)]
+    for closeup, path in drawn:
+        write_summary(trace, path, closeup=closeup)
+    return drawn
 
 
 # ------------------------------------------------------------------------------------------------------------ headline

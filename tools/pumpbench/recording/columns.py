@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     Array = NDArray[Any]
 
 TIMELINE: Final = "sim_time"
+LONG_RUN: Final = 2.5 * 86400
+"""Simulated seconds from which on points and lines are thinner."""
 BIT_RATE: Final = 500_000
 """Bits a second, to tell how long a step's frames would take on a real bus."""
 
@@ -146,9 +148,10 @@ class _Logger:
             self.send(path, np.array([0.0, end_s]), self.rr.Scalars.columns(scalars=np.full(2, limit)))
             style = self.rr.SeriesLines(names=f"limit {limit:.0f}", colors=[colour], widths=[1.0])
             self.recording.log(path, style, static=True)
-        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", GREY, 2.5)
+        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", GREY, 2.5 if end_s < LONG_RUN else 1.5)
         self.line("glucose/interstitial", trace, trace.get("TruthInterstitial"), "interstitial", PURPLE, 0.8)
-        self.points("glucose/cgm", trace.time_s, trace.get("GlucoseConc"), "CGM", BLUE)
+        dot = 2.0 if end_s < LONG_RUN else 0.8  # else they hide the line
+        self.points("glucose/cgm", trace.time_s, trace.get("GlucoseConc"), "CGM", BLUE, size=dot)
         meals = np.array([meal.time_s for meal in trace.meals])
         self.points("glucose/meal", meals, np.full(len(meals), 48.0), "meal (see log)", GREEN, "up", 5.0)
 

@@ -99,7 +99,7 @@ def day(scene: Scene) -> Any:
         rrb.Tabs(*_tables(scene), rrb.TextDocumentView(name="Outcome and run", origin="/run"), active_tab=0),
         row_shares=[4, 4],
     )
-    return rrb.Horizontal(left, right, column_shares=[66, 34], name="Day")
+    return rrb.Horizontal(left, right, column_shares=[66, 34], name="Day" if scene.end_s <= 1.5 * 86400 else "All days")
 
 
 def bus(scene: Scene) -> Any:

@@ -63,8 +63,8 @@ class Scene:
             end_s=max(end_s, start_s + STEP_SECONDS),
             gateway=bool(np.any(frames.channel == 1)),
             glucose_top=max(320.0, _most(trace, *GLUCOSE) + 20),
-            insulin_top=_round_up(_most(trace, "InsulinRateCommanded", "InsulinBolusCommanded")),
-            pram_top=_round_up(_most(trace, "PramRateCommanded", "PramBolusCommanded")),
+            insulin_top=_dose_top(trace, "Insulin"),
+            pram_top=_dose_top(trace, "Pram"),
             frames_top=_round_up(1.5 * _usual_frames(frames)),
             lanes=states + len(faults) + len(alarms),
             close_ups=tuple(close_ups(trace)),
@@ -88,6 +88,11 @@ class Scene:
 
 def _most(trace: Trace, *columns: str) -> float:
     return max(float(np.nanmax(np.append(trace.get(name), 0.0))) for name in columns)
+
+
+def _dose_top(trace: Trace, drug: str) -> float:
+    commanded = _most(trace, f"{drug}RateCommanded", f"{drug}BolusCommanded", f"{drug}BolusDelivered")
+    return _round_up(max(commanded, float(np.nanmax(np.append(trace.basal_delivered(drug), 0.0)))))
 
 
 def _round_up(value: float) -> float:

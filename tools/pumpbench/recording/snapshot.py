@@ -52,10 +52,7 @@ class Shot:
 
 def close_up_shots(scene: Scene, folder: Path) -> list[Shot]:
     """A picture of each close-up of a run, named after what happened in it."""
-    return [
-        Shot(folder / f"fault-{number}-{closeup.slug}.png", closeup.name)
-        for number, closeup in enumerate(scene.close_ups, 1)
-    ]
+    return [Shot(folder / closeup.file_name(number), closeup.name) for number, closeup in enumerate(scene.close_ups, 1)]
 
 
 def snapshot(
