@@ -28,6 +28,7 @@ from can_bus.lockstep import STEP_SECONDS
 from pumpbench import rig
 from pumpbench.capture import Capture, Frames
 from pumpbench.faults import Faults
+from pumpbench.identity import stated
 from pumpbench.outcome import measure
 from pumpbench.runfolder import RunFolder
 from pumpbench.trace import AlarmEvent, Signal, Trace, labels, signals
@@ -94,7 +95,7 @@ def run(
     if bus == "inproc":
         capture = Capture()
         rig.simulate(prepared, capture)
-        outcome = Outcome.of(capture.finish(), prepared.info)
+        outcome = Outcome.of(capture.finish(), prepared.info | {"device": stated(capture.device_info())})
         if out is not None:
             outcome.write(out, overwrite=request.overwrite)
         return outcome

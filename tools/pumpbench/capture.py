@@ -129,6 +129,17 @@ class Capture:
         """
         self._buffers.setdefault(channel, bytearray()).extend(pack(frames))
 
+    def device_info(self) -> dict[str, int] | None:
+        """Raw values of the device's CTRL_Info; None without one.
+
+        It answers the roll call, which is no part of the record but tells which firmware this is.
+        """
+        message = codec.message("CTRL_Info")
+        record = np.frombuffer(bytes(self._buffers.get(0, b"")), _RECORD)
+        record = record[(record["can_id"] == message.can_id) & (record["length"] == message.length)]
+        good = np.flatnonzero(_intact(record["can_id"], record["length"], record["data"]))
+        return message.unpack(record["data"][good[0]].tobytes()) if len(good) else None
+
     def finish(self) -> Frames:
         """Put all frames collected so far into simulated time and canonical order; more may be appended afterwards."""
         return _canonical({channel: np.frombuffer(bytes(raw), _RECORD) for channel, raw in self._buffers.items()})

@@ -41,6 +41,7 @@ def conformance(
     from pumpbench.conformance import suite  # noqa: PLC0415
     from pumpbench.conformance.connect import connected  # noqa: PLC0415
     from pumpbench.files import write_file  # noqa: PLC0415
+    from pumpbench.identity import firmware_sha256  # noqa: PLC0415
 
     try:
         wanted = suite.select(_names(only))
@@ -62,7 +63,15 @@ def conformance(
             )  # fmt: skip
     except suite.NobodyThere as error:
         raise Failed(EXIT_DEAD, str(error)) from error
-    about = {"bus": bus, "firmware": firmware or "reference", "settings": limits.model_dump()}
+    about = {
+        "bus": bus,
+        "firmware": firmware or "reference",
+        "firmware_sha256": firmware_sha256(firmware),
+        "only": only,
+        "modes": must,
+        "long": long,
+        "settings": limits.model_dump(),
+    }
     if out is not None:
         reports.write(report, out, about)
     if junit is not None:

@@ -23,6 +23,7 @@ from can_bus.link import BusLost, Link
 from can_bus.lockstep import Phase
 from can_bus.url import BusUrlError, open_link
 from pumpbench.capture import Capture
+from pumpbench.identity import stated
 from pumpbench.runfolder import RunFolder
 
 COALESCE_SECONDS = 0.005
@@ -92,6 +93,7 @@ def write(folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete
     from pumpbench.outcome import measure  # noqa: PLC0415
     from pumpbench.trace import Trace  # noqa: PLC0415
 
+    info = info | {"device": stated(capture.device_info())}
     frames = capture.finish()
     if not complete:
         folder.write_partial(frames, info)

@@ -8,11 +8,9 @@ bus and the plant's. `inproc`: the same nodes in this process, the same frames, 
 import contextlib
 import functools
 import hashlib
-import importlib.metadata
 import json
 import logging
 import os
-import platform
 import re
 import select
 import shlex
@@ -28,7 +26,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, NamedTuple, TypedDict
 
-import dbc
 from can_bus.faults import Hang, MemoryState, NodeControl, NodeFault, Restart
 from can_bus.frame import Frame
 from can_bus.gateway import Gateway, Side
@@ -44,12 +41,12 @@ from plant_server.sensor import load_sensor
 from plant_server.sensors.ideal import Ideal
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
-from pumpbench import __version__
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
 from pumpbench.capture import Capture
 from pumpbench.controller_model import ControllerModel, ControllerModelError, read_models, shipped_models
 from pumpbench.faults import Faults, write_wire
 from pumpbench.faults import load as load_fault_file
+from pumpbench.identity import SOMEBODY_ELSES, firmware_sha256, versions
 from pumpbench.node import InProcess, Process
 from pumpbench.recorder import write
 from pumpbench.runfolder import RunFolder
@@ -60,12 +57,7 @@ END_SECONDS = 5.0
 SERIAL = "slcan:"
 """Buses that one program opens."""
 
-SOMEBODY_ELSES = "none"
-"""As --firmware: the device runs by itself."""
-
 WRITE_SECONDS = 600.0
-
-PACKAGES = ("numpy", "numba", "python-can", "cantools", "autosar-e2e", "rerun-sdk")
 
 
 class RigError(ValueError):
@@ -169,11 +161,7 @@ def prepare(request: Request) -> Prepared:
     run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, injected)
     PlantServer(run).rehearse()  # checks the rest, and loads compiled code before anybody waits on a bus
     info = {
-        "pumpbench": __version__,
-        "protocol": ".".join(map(str, dbc.protocol_version())),
-        "dbc_crc32": f"{dbc.crc32():08x}",
-        "python": platform.python_version(),
-        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
+        **versions(),
         "patient": request.patient,
         "physiology": patient.physiology,
         "pramlintide": request.pramlintide,
@@ -186,6 +174,7 @@ def prepare(request: Request) -> Prepared:
         "sensor": request.sensor,
         "bus": request.bus,
         "firmware": request.firmware or "built-in",
+        "firmware_sha256": firmware_sha256(request.firmware),
         **({"reset": request.reset_hook or request.reset_line} if request.reset_hook or request.reset_line else {}),
         **({"free_running": True, "speed": request.speed, "reproducible": False} if request.free_running else {}),
         "faults": faults.as_json(),

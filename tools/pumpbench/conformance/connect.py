@@ -14,8 +14,9 @@ from can_bus.link import Link
 from can_bus.url import open_link
 from pumpbench.conformance.device import Device, Remote
 from pumpbench.conformance.registry import Need
+from pumpbench.identity import SOMEBODY_ELSES
 from pumpbench.node import Process
-from pumpbench.rig import SOMEBODY_ELSES, Child, NodeDied, RigError, firmware_command
+from pumpbench.rig import Child, NodeDied, RigError, firmware_command
 
 RESET_SECONDS = 30.0
 """How long a command that resets a device may take."""

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import dbc
 from can_bus.frame import Frame
-from pumpbench import __version__
 from pumpbench.bench import frame_text
 from pumpbench.conformance.registry import checks
+from pumpbench.conformance.requirements import Requirement, requirements
 from pumpbench.conformance.suite import Report, Result, Verdict
 from pumpbench.files import write_file
+from pumpbench.identity import versions
 
 SHOWN = 16
 """Frames before a failure that a report shows; the log has all."""
@@ -51,20 +51,26 @@ def log(frames: Sequence[Frame]) -> str:
 
 
 def as_json(report: Report, about: dict[str, Any]) -> str:
-    """Everything, machine-readable."""
+    """Everything, machine-readable; it stands alone, so requirements and checks are told in words, too."""
     content = {
-        "pumpbench": __version__,
-        "protocol": ".".join(map(str, dbc.protocol_version())),
-        "dbc_crc32": f"{dbc.crc32():08x}",
+        **versions(),
         **about,
+        "device": report.device,
         "offers": sorted(report.offers),
         "holds": report.holds,
+        "catalogue": len(requirements()),
         "requirements": [
             {
                 "id": each.requirement.id,
                 "verdict": each.verdict.value,
                 "text": each.text,
                 "seconds": round(each.seconds, 3),
+                "requirement": each.requirement.text,
+                "group": each.requirement.group,
+                "hazards": list(each.requirement.hazards),
+                "source": each.requirement.source,
+                "binds": each.requirement.binds,
+                "check": _how(each.requirement),
             }
             for each in report.results
         ],
@@ -104,6 +110,12 @@ def _clean(text: str) -> str:
     return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)
 
 
+def _how(requirement: Requirement) -> str:
+    """How a requirement is checked, or where it is shown instead."""
+    found = checks().get(requirement.id)
+    return found.how if found is not None else (requirement.evidence or "")
+
+
 def as_markdown(report: Report, title: str) -> str:
     """The table requirement -> check -> result."""
     rows = [
@@ -115,8 +127,7 @@ def as_markdown(report: Report, title: str) -> str:
         "|---|---|---|---|---|",
     ]
     for each in report.results:
-        found = checks().get(each.requirement.id)
-        how = found.how if found is not None else (each.requirement.evidence or "")
+        how = _how(each.requirement)
         hazards = " ".join(each.requirement.hazards)
         result = each.verdict.value + (f": {each.text}" if each.text else "")
         cells = (each.requirement.id, each.requirement.text, how, hazards, result)

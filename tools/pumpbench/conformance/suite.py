@@ -2,9 +2,9 @@
 
 import enum
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 from can_bus import codec
 from can_bus.frame import Frame
@@ -15,6 +15,7 @@ from pumpbench.conformance.driver import Bench, Silent, Violation
 from pumpbench.conformance.registry import MEALTIME, Check, Dut, Need, NotOffered, checks
 from pumpbench.conformance.requirements import Requirement, requirements
 from pumpbench.conformance.settings import Settings
+from pumpbench.identity import stated
 
 PRAMLINTIDE: tuple[Need, ...] = ("s1", "s2", "s3", "s4")
 
@@ -51,10 +52,11 @@ class Result:
 
 
 class Report(NamedTuple):
-    """All results, in the order of the catalogue, and what the device can do."""
+    """All results, in the order of the catalogue, what the device can do, and what it says it is (CTRL_Info)."""
 
     results: list[Result]
     offers: frozenset[Need]
+    device: Mapping[str, Any] | None = None
 
     def of(self, verdict: Verdict) -> list[Result]:
         """The results with one verdict."""
@@ -116,7 +118,7 @@ def run(
         BusLost: the bus is gone.
     """
     wanted = list(requirements().values()) if wanted is None else wanted
-    _await(device, patience)
+    said = _await(device, patience)
     dut = Dut(device, settings, _offers(device, must, memory=memory), long=long)
     results: list[Result] = []
     gone = ""
@@ -131,22 +133,23 @@ def run(
         if result.verdict == Verdict.FAILED and not _revive(device):
             gone = f"since {requirement.id} the device answers nothing"
     progress(len(wanted), len(wanted))
-    return Report(results, dut.offers)
+    return Report(results, dut.offers, stated(said))
 
 
-def _await(device: Device, patience: float) -> None:
+def _await(device: Device, patience: float) -> Mapping[str, int] | None:
+    """Wait for the answer to a roll call; returns the CTRL_Info in it, if there is one."""
     over = time.monotonic() + patience
     while True:
         try:
             device.renew()
-            Bench(device, start=False).call_roll()
+            said = Bench(device, start=False).call_roll().all("CTRL_Info")
         except Silent as silent:
             if time.monotonic() > over:
                 raise NobodyThere(f"nobody answers the roll call on this bus: {silent}") from silent
         except Violation:
-            return  # somebody is there, though it breaks rules: the checks say which
+            return None  # somebody is there, though it breaks rules: the checks say which
         else:
-            return
+            return said[0] if said else None
 
 
 def _revive(device: Device) -> bool:
