@@ -13,6 +13,7 @@ from pumpbench import __version__
 from pumpbench.cli_conformance import conformance
 from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
+from pumpbench.cli_report import report
 from pumpbench.cli_view import snapshot, view
 from pumpbench.terminal import (
     EXIT_DEAD,
@@ -473,6 +474,7 @@ app.command(name="faults")(faults_command)
 app.command()(matrix)
 app.command()(hunt)
 app.command()(conformance)
+app.command()(report)
 app.command()(doctor)
 app.command()(view)
 app.command()(snapshot)

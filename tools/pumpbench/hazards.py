@@ -82,6 +82,21 @@ FIRST_HAZARDS = 20
 MEMORY_LOST = codec.choice("FAULT_Inject", "FaultKind", "NodeMemoryLost")
 
 
+NAMES = {
+    "H1": "a bolus delivered twice, or after its expiry",
+    "H2": "any dose above the limits of either side",
+    "H3": "dosing on a CGM sample that is stale, repeated, failed its E2E check or is implausible",
+    "H4": "insulin above the schedule when the last usable CGM sample is older than 15 min (age 4..6 steps), anything "
+    "but the schedule from age 7 on, pramlintide while insulin is suspended",
+    "H5": "a new bolus while an earlier one is uncertain",
+    "H6": "an unaccounted stroke: commanded = delivered + pending + lost, per drug, at every step",
+    "H7": "a silent failure: a node dead, a frame lost or a limit hit that no alarm and no counter shows",
+    "H8": "state lost over a reset: another mode, a meal forgotten, or insulin on board that fell faster than insulin "
+    "can",
+}
+"""What each hazard is, in the words of docs/design.md."""
+
+
 class Hazards(dict[str, int]):
     """Counts by name.
 

@@ -193,15 +193,20 @@ class RunFolder:
         return self._json(METRICS)
 
     @functools.cached_property
-    def frames(self) -> Frames:
-        """Every frame, from bus.log, checked against the hash in run.json."""
+    def logged(self) -> Frames:
+        """Every frame in bus.log, whether or not it is the one that was recorded."""
         path = self.path / LOG
         try:
-            frames = read_candump(path)
+            return read_candump(path)
         except OSError as error:
             raise RunFolderError(f"cannot read {path}: {error.strerror}") from None
         except ValueError as error:
             raise RunFolderError(str(error)) from None
+
+    @functools.cached_property
+    def frames(self) -> Frames:
+        """Every frame, from bus.log, checked against the hash in run.json."""
+        path, frames = self.path / LOG, self.logged
         if "trace_sha256" in self.info and frames.sha256() != self.info["trace_sha256"]:
             theirs, ours = self.info.get("dbc_crc32"), f"{dbc.crc32():08x}"
             if theirs not in (None, ours):
@@ -243,17 +248,17 @@ class RunFolder:
 
 
 def _dump(content: Mapping[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Only what JSON has: numbers of numpy become numbers, NaN becomes null, a path or anything else its text."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, str | int | float | None) else str(value)
