@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -210,7 +211,7 @@ def test_a_hazard_is_red(harmful: Path) -> None:
 def test_what_was_not_judged_is_not_called_safe(folders: Path) -> None:
     run = load(folders / "clean")
     safety = {**run.safety, "hazards": dict.fromkeys(run.hazards)}
-    free = Evidence(run.folder, run.info, run.files, (), run.trace, {**run.metrics, "safety": safety})
+    free = replace(run, metrics={**run.metrics, "safety": safety})
     assert free.counted is None
     assert free.verdict.level == Level.OPEN
     assert free.verdict.text.startswith("not judged: H1, H2, H3, H4, H5, H6, H7, H8; both ledgers close")
@@ -220,9 +221,7 @@ def test_what_was_not_judged_is_not_called_safe(folders: Path) -> None:
 def test_a_ledger_that_does_not_close_is_red(folders: Path) -> None:
     run = load(folders / "clean")
     ledger = {**run.safety["ledger"], "insulin": {**run.safety["ledger"]["insulin"], "closes": False}}
-    open_ = Evidence(
-        run.folder, run.info, run.files, (), run.trace, {**run.metrics, "safety": {**run.safety, "ledger": ledger}}
-    )
+    open_ = replace(run, metrics={**run.metrics, "safety": {**run.safety, "ledger": ledger}})
     assert open_.verdict.level == Level.BAD
     assert "the ledger of insulin does not close" in open_.verdict.text
 
@@ -339,10 +338,25 @@ def test_an_overview_with_links_and_a_comparison(folders: Path, harmful: Path) -
     assert len(shown.ids) == len(set(shown.ids))
 
 
-def test_runs_of_another_seed_are_not_compared(folders: Path, tmp_path: Path) -> None:
-    bench.run(strategy="s2", hours=6, seed=2, out=tmp_path / "other")
-    assert "#compared" not in rendered(load(folders / "clean"), load(tmp_path / "other")).links
-    assert "#compared" in rendered(load(folders / "clean"), load(folders / "dropped")).links
+def test_strategies_are_compared_and_seeds_are_not(folders: Path, tmp_path: Path) -> None:
+    for name, how in (("seed", {"seed": 2}), ("strategy", {"strategy": "nma"})):
+        bench.run(**{"strategy": "s2", "hours": 6, "out": tmp_path / name} | how)
+    assert "#compared" not in rendered(load(folders / "clean"), load(tmp_path / "seed")).links
+    shown = rendered(load(folders / "clean"), load(tmp_path / "strategy"))
+    (rows,) = shown.captions["adult#001, validation-14d, seed 1, 72 steps"]
+    assert [row[1] for row in rows[1:]] == ["s2", "nma"]
+
+
+def test_runs_are_compared_by_the_hashes_of_their_parameters(folders: Path) -> None:
+    """Not by names alone: a file of patients may have changed between two runs."""
+    clean, dropped = load(folders / "clean"), load(folders / "dropped")
+
+    def with_other(name: str) -> Evidence:
+        parameters = {**dropped.info.parameters, name: "0" * 64}
+        return replace(dropped, info=dropped.info.model_copy(update={"parameters": parameters}))
+
+    assert "#compared" not in rendered(clean, with_other("patient_sha256")).links
+    assert "#compared" in rendered(clean, with_other("calibration_sha256")).links  # it follows from the strategy
 
 
 def test_headings_are_in_order(folders: Path) -> None:
