@@ -1,4 +1,4 @@
-"""The Rerun recording, read back as data, and pictures of it where a Vulkan driver is installed."""
+"""The Rerun recording, read back as data; how it looks is in test_looks.py."""
 
 import subprocess
 import sys
@@ -192,39 +192,6 @@ def test_notes_and_clock(run: Run) -> None:
     assert clock(13 * 86400 + 23 * 3600 + 59 * 60 + 59) == "d13 23:59"
     assert {note.kind for note in notes(run.trace)} == {"ALARM", "FAULT", "MEAL", "STATE"}
     assert state_changes(run.trace, "NoSuchSignal", "CTRL_Status") == []
-
-
-# ------------------------------------------------------------------------------------------------------------ pictures
-
-
-def size(png: Path) -> tuple[int, int]:
-    header = png.read_bytes()[:24]
-    assert header[:8] == b"\x89PNG\r\n\x1a\n"
-    return int.from_bytes(header[16:20]), int.from_bytes(header[20:24])
-
-
-def test_snapshot_by_the_viewer(run: Run, tmp_path: Path) -> None:
-    png = tmp_path / "shot.png"
-    run.trace.save(run.path.parent / "trace.parquet")
-    how = snapshot(run.path, [Shot(png, window=(3600.0, 6 * 3600.0))], size=(1200, 800))
-    if "Matplotlib" in how:
-        pytest.skip(how)
-    assert how == "drawn by Rerun's viewer, off-screen"  # and no view complains
-    assert size(png) == (1200, 800)
-    from matplotlib.image import imread
-
-    picture = imread(png)[..., :3]
-    red = (picture[..., 0] > 0.6) & (picture[..., 1] < 0.3) & (picture[..., 2] < 0.3)
-    assert red[520:, :780].sum() > 500  # the lane of the injected fault
-
-
-def test_snapshot_without_a_vulkan_driver(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")
-    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
-    run.trace.save(run.path.parent / "trace.parquet")
-    how = snapshot(run.path, [Shot(tmp_path / "shot.png")])
-    assert how.startswith("drawn by Matplotlib, because Rerun's viewer cannot draw here: it ended with status")
-    assert size(tmp_path / "shot.png") == (1600, 1000)
 
 
 def test_snapshot_of_nothing(tmp_path: Path) -> None:
