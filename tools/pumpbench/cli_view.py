@@ -39,16 +39,16 @@ def view(
     target = str(_newest()) if run is None else run
     try:
         if target.startswith(viewing.URL_SCHEMES):
-            if fault is not None:
-                raise Failed(EXIT_USAGE, f"--fault needs a recording that is complete; {target} is being made")
-            viewing.view(target, layout=layout or "day", window=_around(at, None), web=web, say=_say)
+            if fault is not None or (web and (layout or at)):
+                raise Failed(
+                    EXIT_USAGE, f"{target} is being made and has its own looks: no --fault, nor others with --web"
+                )
+            _show(target, layout or "day", _around(at, None), web)
             return
         with viewing.readable(_recording(Path(target))) as recording:
             scene = scene_of(recording)
-            chosen = layout or "day"
-            if fault is not None:
-                chosen = _close_up(scene, fault)
-            viewing.view(recording, layout=chosen, window=_around(at, scene), web=web, say=_say)
+            chosen = (layout or "day") if fault is None else _close_up(scene, fault)
+            _show(recording, chosen, _around(at, scene), web)
     except viewing.ViewerError as error:
         raise Failed(EXIT_DEAD, str(error)) from None
     except ValueError as error:  # no such layout, or no recording of ours
@@ -94,6 +94,15 @@ def snapshot(
     errors.print(how, markup=False)
     for shot in shots:
         console.print(str(shot.path), markup=False, soft_wrap=True)
+
+
+def _show(source: Path | str, layout: str, window: "Window | None", web: bool) -> None:
+    from pumpbench.recording import viewing  # noqa: PLC0415
+
+    if web:
+        viewing.serve_page(source, _say, layout=layout, window=window)
+    else:
+        viewing.open_window(source, layout=layout, window=window)
 
 
 def _say(address: str) -> None:

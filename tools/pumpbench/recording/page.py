@@ -1,72 +1,117 @@
-"""Rerun's viewer as a page for a browser on this machine, which talks to nobody but the recording's server.
+"""Rerun's web viewer as a page on this machine that talks to nobody else.
 
-The page that Rerun serves asks for a font, for the newest release and for examples, and posts what it is used for to
-Rerun's makers. There is no switch for the latter in a browser, so the page passes through here and gets a
-Content-Security-Policy, by which the browser itself refuses all of that.
+Rerun's own server gives the viewer's files to the whole network or, asked to bind, to this machine; but the page it
+gives then asks four hosts for fonts, examples and news, and reports its use to one of them. So the files are taken from
+it once and served here, with a content security policy that lets the browser talk to the page's own server and to the
+recording's, and to no other.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import http.server
+import socket
+import subprocess
+import tempfile
 import threading
-import urllib.error
+import time
 import urllib.request
-from collections.abc import Iterator
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Final
-from urllib.parse import quote, urlsplit
 
-PASSED_ON: Final = ("Content-Type", "Content-Encoding")
+from pumpbench.recording.tool import RecordingError, quiet_environment, rerun_binary
+
+ADDRESS: Final = "127.0.0.1"
+FILES: Final = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
+START_SECONDS: Final = 30.0
 
 
-@contextlib.contextmanager
-def served(upstream: str, recording: str, port: int) -> Iterator[str]:
-    """Serve the page on 127.0.0.1 as long as this lasts; the value is the address to open.
+class Page:
+    """Serves the page from threads of its own until it is closed.
 
     Args:
-        upstream: address of the page that Rerun serves.
-        recording: `rerun+http://host:port/proxy` of what it is to show.
-        port: to serve on.
+        port: of the page.
+        source_port: of the recording's server.
 
     Raises:
-        OSError: somebody else listens on that port.
+        RecordingError: Rerun does not give its viewer.
+        OSError: the port is taken.
     """
-    source = urlsplit(recording.removeprefix("rerun+")).netloc
-    policy = (
-        "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
-        f"connect-src 'self' http://{source} https://{source} data: blob:"
+
+    def __init__(self, port: int, source_port: int) -> None:
+        with contextlib.ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pumpbench-page-")))
+            _take_files(folder)
+            handler = functools.partial(_Handler, directory=str(folder), policy=_policy(source_port))
+            server = stack.enter_context(http.server.ThreadingHTTPServer((ADDRESS, port), handler))
+            stack.callback(server.shutdown)
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            self._stack = stack.pop_all()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._stack.close()
+
+
+def _policy(source_port: int) -> str:
+    """What a browser may load: scripts and wasm of the page itself, and the recording, by either name of the host."""
+    sources = " ".join(f"http://{host}:{source_port}" for host in (ADDRESS, "localhost"))
+    scripts = "'self' 'unsafe-inline' 'unsafe-eval' blob:"
+    return (
+        f"default-src 'self' blob: data:; script-src {scripts}; style-src 'self' 'unsafe-inline'; "
+        f"connect-src 'self' blob: data: {sources}"
     )
 
-    class Page(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            try:
-                with urllib.request.urlopen(upstream + self.path) as answer:
-                    body: bytes = answer.read()
-                    headers = {name: answer.headers[name] for name in PASSED_ON if answer.headers[name]}
-            except urllib.error.HTTPError as error:
-                self.send_error(error.code)
-                return
-            except OSError as error:
-                self.send_error(HTTPStatus.BAD_GATEWAY, str(error))
-                return
-            self.send_response(HTTPStatus.OK)
-            for name, value in (
-                headers | {"Content-Length": str(len(body)), "Content-Security-Policy": policy}
-            ).items():
-                self.send_header(name, value)
-            self.end_headers()
-            with contextlib.suppress(ConnectionError):  # the browser went away
-                self.wfile.write(body)
 
-        def log_message(self, *_arguments: object) -> None:
-            pass
+class _Handler(http.server.SimpleHTTPRequestHandler):
+    """A file server that sends the policy along and writes no log."""
 
-    with ThreadingHTTPServer(("127.0.0.1", port), Page) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True)
-        thread.start()
+    def __init__(self, *arguments: object, directory: str, policy: str) -> None:
+        self._policy = policy
+        super().__init__(*arguments, directory=directory)  # type: ignore[arg-type]
+
+    def end_headers(self) -> None:
+        self.send_header("Content-Security-Policy", self._policy)
+        super().end_headers()
+
+    def log_message(self, *_arguments: object) -> None:
+        pass
+
+
+def _take_files(folder: Path) -> None:
+    """Get the viewer out of Rerun's program, which serves it but does not tell where it has it."""
+    with socket.socket() as probe:
+        probe.bind((ADDRESS, 0))
+        port = probe.getsockname()[1]
+    source = f"rerun+http://{ADDRESS}:1/proxy"  # it wants to know one; nobody will ask it
+    command = [str(rerun_binary()), "--serve-web", "--bind", ADDRESS, "--web-viewer-port", str(port), source]
+    with tempfile.TemporaryDirectory() as scratch:
+        server = subprocess.Popen(
+            command,
+            env=quiet_environment(Path(scratch)),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         try:
-            yield f"http://127.0.0.1:{port}/?url={quote(recording, safe='')}"
+            _wait_for(server, port)
+            for name in FILES:
+                address = f"http://{ADDRESS}:{port}/{name.replace('index.html', '')}"
+                with urllib.request.urlopen(address, timeout=START_SECONDS) as answer:
+                    (folder / name).write_bytes(answer.read())
+        except OSError as error:
+            raise RecordingError(f"Rerun's web viewer cannot be had: {error}") from error
         finally:
-            server.shutdown()
-            thread.join()
+            server.kill()  # it may have inherited that SIGTERM is ignored
+            server.wait()
+
+
+def _wait_for(server: subprocess.Popen[bytes], port: int) -> None:
+    deadline = time.monotonic() + START_SECONDS
+    while True:
+        with contextlib.suppress(OSError), socket.create_connection((ADDRESS, port), timeout=1):
+            return
+        if server.poll() is not None or time.monotonic() > deadline:
+            raise ConnectionError("its server does not come up")
+        time.sleep(0.02)

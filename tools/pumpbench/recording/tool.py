@@ -30,7 +30,9 @@ def quiet_environment(scratch: Path) -> dict[str, str]:
     """
     settings = scratch / "rerun" / "analytics.json"
     settings.parent.mkdir(parents=True, exist_ok=True)
-    settings.write_text(json.dumps({"analytics_enabled": False, "analytics_id": "none", "metadata": {}}))
+    content = {"analytics_enabled": False, "analytics_id": "none", "metadata": {}}
+    places = {"config_file_path": str(settings), "data_dir_path": str(settings.parent)}  # without them it is not read
+    settings.write_text(json.dumps(content | places))
     return os.environ | {"XDG_CONFIG_HOME": str(scratch), "RUST_LOG": "error", "NO_COLOR": "1"}
 
 
