@@ -50,6 +50,7 @@ NOT_HERE = {
     "git apply": "tests/test_extending.py applies them",
     "extending/filebus": "tests/test_extending.py installs it",
     "filebus:": "tests/test_extending.py runs on it",
+    "pumpbench view": "waits for whoever looks; tests/test_looks.py",
     'pytest --pumpbench-bus hub --pumpbench-firmware "./build/firmware': "tests/test_example_repository.py does it",
 }
 """Parts of commands that are not run here, and why not; their options are looked up all the same."""
