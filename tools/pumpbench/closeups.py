@@ -25,7 +25,7 @@ LONGEST: Final = 8.0 * HOUR
 """A close-up of more is none: of a longer fault the beginning is shown."""
 
 MAX_CLOSE_UPS: Final = 8
-"""A reader does not look at more, and each costs 80 kB of every recording. The gravest are kept."""
+"""A reader does not look at more, and each takes 80 kB of the recording. The gravest are kept."""
 
 GRAVITY: Final = {"High": 0, "fault": 1, "Medium": 2, "Low": 3}
 
