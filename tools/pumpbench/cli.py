@@ -11,6 +11,7 @@ import typer
 
 from pumpbench import __version__
 from pumpbench.cli_conformance import conformance
+from pumpbench.cli_diff import diff
 from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
 from pumpbench.cli_report import report
@@ -475,6 +476,7 @@ app.command()(matrix)
 app.command()(hunt)
 app.command()(conformance)
 app.command()(report)
+app.command()(diff)
 app.command()(doctor)
 app.command()(view)
 app.command()(snapshot)
@@ -522,6 +524,7 @@ def _status(error: Exception) -> int | None:
     from pumpbench.calibration import CalibrationError  # noqa: PLC0415
     from pumpbench.campaign import CampaignError, ClusterError  # noqa: PLC0415
     from pumpbench.closed_loop import CaseError, LoopError  # noqa: PLC0415
+    from pumpbench.comparison.record import RecordError  # noqa: PLC0415
     from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
     from pumpbench.convert import ConvertError  # noqa: PLC0415
     from pumpbench.hunt import HuntError  # noqa: PLC0415
@@ -535,6 +538,7 @@ def _status(error: Exception) -> int | None:
     wrong |= (
         CalibrationError | ControllerModelError | ConvertError | HuntError | RecordingError | RigError | RunFolderError
     )
+    wrong |= RecordError
     if isinstance(error, wrong):
         return EXIT_USAGE
     if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
