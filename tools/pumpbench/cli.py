@@ -16,6 +16,7 @@ from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
 from pumpbench.cli_report import report
 from pumpbench.cli_view import snapshot, view
+from pumpbench.cli_replay import replay
 from pumpbench.terminal import (
     EXIT_DEAD,
     EXIT_INTERRUPTED,
@@ -477,6 +478,7 @@ app.command()(hunt)
 app.command()(conformance)
 app.command()(report)
 app.command()(diff)
+app.command()(replay)
 app.command()(doctor)
 app.command()(view)
 app.command()(snapshot)
@@ -529,6 +531,7 @@ def _status(error: Exception) -> int | None:
     from pumpbench.convert import ConvertError  # noqa: PLC0415
     from pumpbench.hunt import HuntError  # noqa: PLC0415
     from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
+    from pumpbench.replay import ReplayError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
 
@@ -539,6 +542,7 @@ def _status(error: Exception) -> int | None:
         CalibrationError | ControllerModelError | ConvertError | HuntError | RecordingError | RigError | RunFolderError
     )
     wrong |= RecordError
+    wrong |= RecordError | ReplayError
     if isinstance(error, wrong):
         return EXIT_USAGE
     if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):

@@ -1,0 +1,56 @@
+"""The command that feeds a recorded run into a firmware."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pumpbench.cli_diff import IGNORE, RECORDS
+from pumpbench.terminal import EXIT_DEAD, EXIT_WRONG, console, progress_bar
+
+
+def replay(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help=RECORDS)],
+    firmware: Annotated[
+        str | None,
+        typer.Option(help='Command that starts the device, "{bus}" and "{nvm}" in it; none: it runs by itself.'),
+    ] = None,
+    bus: Annotated[
+        str | None,
+        typer.Option(
+            help="inproc (the reference), hub, or the URL of the device's bus (default: hub with --firmware)."
+        ),
+    ] = None,
+    ignore: Annotated[list[str] | None, typer.Option(help=IGNORE)] = None,
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going", help="Compare on behind the first difference, with the recorded inputs.")
+    ] = False,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for the end of a turn.", min=0.05)] = 5.0,
+    connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the first answer.", min=0.1)] = 10.0,
+    reset_hook: Annotated[str | None, typer.Option(help="Command that resets a device that runs by itself.")] = None,
+    json_file: Annotated[str | None, typer.Option("--json", help="Write the report to this file; - is stdout.")] = None,
+) -> None:
+    """Feed what a recorded device heard into a firmware. Exit status 1 if it answers otherwise, 3 if not at all."""
+    from pumpbench import replay as replays  # noqa: PLC0415
+    from pumpbench.files import write_file  # noqa: PLC0415
+
+    with progress_bar() as bar:
+        outcome = replays.replay(
+            run,
+            bus=bus or ("inproc" if firmware is None else "hub"),
+            firmware=firmware,
+            ignore=ignore or (),
+            keep_going=keep_going,
+            timeout=timeout,
+            connect_timeout=connect_timeout,
+            reset_hook=reset_hook,
+            progress=bar("turns"),
+        )
+    if json_file == "-":
+        typer.echo(outcome.json(), nl=False)
+    else:
+        if json_file is not None:
+            write_file(Path(json_file), outcome.json().encode())
+        console.print(outcome.text(), markup=False, soft_wrap=True)
+    if not outcome.same:
+        raise typer.Exit(EXIT_WRONG if outcome.silent is None else EXIT_DEAD)
