@@ -298,6 +298,14 @@ ODD = [
 ]
 
 
+def test_frames_that_a_bus_can_carry_are_recorded_as_they_came() -> None:
+    capture = Capture()
+    capture.extend(0, ODD)
+    assert [(frame.can_id, len(frame.data)) for frame in capture.finish().frames()] == [
+        (frame.can_id, len(frame.data)) for frame in ODD
+    ]
+
+
 @pytest.mark.parametrize("gateway", [False, True])
 def test_candump_round_trip(tmp_path: Path, gateway: bool) -> None:
     made = Loop(30, faults=dropping("CGM_Reading", range(5, 8)) if gateway else None)

@@ -359,7 +359,8 @@ def _canonical(records: dict[int, Array]) -> Frames:
         record = records[channel]
         can_id, length = record["can_id"].astype("u4"), record["length"].astype("u1")
         # what no CAN bus can carry is written down as the nearest that it can, so that a log says the same
-        can_id[(can_id > CAN_SFF_MASK) & (can_id & _FLAGS == 0)] |= np.uint32(CAN_EFF_FLAG)
+        too_long = (can_id & ~np.uint32(CAN_RTR_FLAG) > CAN_SFF_MASK) & (can_id & _FLAGS == 0)
+        can_id[too_long] |= np.uint32(CAN_EFF_FLAG)
         carried = (np.arange(MAX_DATA) < length[:, None]) & (can_id & CAN_RTR_FLAG == 0)[:, None]
         data = record["data"].reshape(-1, MAX_DATA) * carried.astype("u1")
         keep, step, turn, micros = _assign(can_id, length, data)
