@@ -220,9 +220,9 @@ def _call_roll(device: Device, patience: float) -> None:
         try:
             turn = Bench(device, start=False).call_roll()
             break
-        except Silent:
+        except Silent as silent:
             if time.monotonic() > over:
-                raise Silent(f"an answer to the roll call within {patience:g} s; nothing came") from None
+                raise Silent(f"an answer within {patience:g} s; the last call: expected {silent}") from None
     info = turn.all("CTRL_Info")
     judge_version(stated_version(info[-1]) if info else None, turn.done["DoneStatus"])
 
@@ -382,7 +382,7 @@ def _check_power(turns: list[Turn], device: Device, offers: frozenset[Need], *, 
                 raise ReplayError(f"the device lost its power in {turn.where}: give --reset-hook to switch this one")
             if event.memory != "kept" and by_itself:
                 raise ReplayError(f"the device's memory was {event.memory} in {turn.where}, which no reset hook can do")
-            if event.memory == "torn" and "memory" not in offers:
+            if event.memory == "torn" and "nvm" in offers and "memory" not in offers:
                 raise ReplayError(
                     f"the device's memory was torn in {turn.where}, which can be done to the reference firmware only"
                 )
