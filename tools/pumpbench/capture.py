@@ -237,7 +237,7 @@ def _without_roll_call(can_id: Array, words: Array, tokens: list[_Token], done: 
     keep = np.ones(len(can_id), bool)
     phases = _phases()
     called, call, opening = -1, -1, len(can_id)
-    for token, following in zip(tokens, [*tokens[1:], None], strict=True):
+    for token, following in zip(tokens, [*tokens[1:], None], strict=False):  # no token at all: nothing to look at
         if token.phase != phases["Init"]:
             continue
         if following is None:
