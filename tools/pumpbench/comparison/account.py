@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from can_bus import codec
-from pumpbench.comparison.align import Comparison
+from can_bus.lockstep import STEP_SECONDS
+from pumpbench.comparison.align import Comparison, Kind
 from pumpbench.trace import AlarmEvent, Trace, labels
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ class MessageCount(NamedTuple):
 
 def per_message(comparison: Comparison) -> list[MessageCount]:
     """The messages that differ, in order of their first difference."""
-    names = {message.can_id: message.name for message in codec.messages().values()}
     counts: dict[int, dict[str, int]] = {}
     for difference in comparison.differences:
         frames, row = comparison.place(difference)
@@ -42,7 +42,7 @@ def per_message(comparison: Comparison) -> list[MessageCount]:
         kinds[difference.kind] += 1
     return [
         MessageCount(
-            names.get(can_id, f"0x{can_id:X}"),
+            _name(can_id),
             **kinds,
             frames=(
                 int(np.count_nonzero(comparison.a.can_id[comparison.compared[0]] == can_id)),
@@ -51,6 +51,37 @@ def per_message(comparison: Comparison) -> list[MessageCount]:
         )
         for can_id, kinds in counts.items()
     ]
+
+
+class Stretch(NamedTuple):
+    """Simulated seconds [start_s, end_s) in which a message differs in every step, and how."""
+
+    start_s: float
+    end_s: float
+    kind: Kind
+
+
+def stretches(comparison: Comparison) -> dict[str, list[Stretch]]:
+    """When which message differs, in order of their first difference."""
+    steps: dict[str, dict[int, Kind]] = {}
+    for difference in comparison.differences:
+        frames, row = comparison.place(difference)
+        steps.setdefault(_name(int(frames.can_id[row])), {}).setdefault(int(frames.step[row]), difference.kind)
+    result: dict[str, list[Stretch]] = {}
+    for message, kinds in steps.items():
+        runs = result[message] = []
+        for step, kind in sorted(kinds.items()):
+            start_s, end_s = float(step * STEP_SECONDS), float((step + 1) * STEP_SECONDS)
+            if runs and runs[-1].end_s == start_s and runs[-1].kind == kind:
+                runs[-1] = runs[-1]._replace(end_s=end_s)
+            else:
+                runs.append(Stretch(start_s, end_s, kind))
+    return result
+
+
+def _name(can_id: int) -> str:
+    known = codec.messages_by_id().get(can_id)
+    return f"0x{can_id:X}" if known is None else known.name
 
 
 class Quantity(NamedTuple):

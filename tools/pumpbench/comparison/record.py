@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import dbc
+from can_bus import codec
 from pumpbench.capture import Frames, read_candump
 from pumpbench.runfolder import RunFolder
 from pumpbench.trace import Trace
@@ -51,8 +52,9 @@ class Record:
             raise RecordError(f"cannot read {path}: {error.strerror}") from None
         except ValueError as error:
             raise RecordError(str(error)) from None
-        if not len(frames):
-            raise RecordError(f"{path}: no frame of a run in it")
+        token = codec.message("SYNC_Step")
+        if not (frames.intact & (frames.can_id == token.can_id)).any():
+            raise RecordError(f"{path} has no {token.name} of a run in it: without one no frame has its instant")
         return cls(str(path), frames)
 
     @functools.cached_property

@@ -14,7 +14,7 @@ from can_bus.faults import clock
 from can_bus.frame import Frame
 from pumpbench.bench import frame_text
 from pumpbench.comparison import account
-from pumpbench.comparison.align import Comparison, Difference, Ignore
+from pumpbench.comparison.align import Comparison, Difference, Ignore, Kind
 from pumpbench.comparison.record import Record
 from pumpbench.trace import Signal, signals
 
@@ -142,7 +142,7 @@ class Report:
         difference = self.comparison.first
         assert difference is not None
         frames, row = self.comparison.place(difference)
-        a, b = self._pair(difference)
+        a, b = self.pair(difference)
         lines = [f"first difference: {self.where(difference)}"]
         before = self.before(difference)
         if before:
@@ -180,7 +180,8 @@ class Report:
         kept = ~np.isin(frames.can_id[earlier], list(self.comparison.ignore.messages))
         return [int(each) for each in earlier[kept][-BEFORE:]]
 
-    def _pair(self, difference: Difference) -> tuple[Frame | None, Frame | None]:
+    def pair(self, difference: Difference) -> tuple[Frame | None, Frame | None]:
+        """The frame in A and in B."""
         a = None if difference.a is None else self.comparison.a.frame(difference.a)
         b = None if difference.b is None else self.comparison.b.frame(difference.b)
         return a, b
@@ -246,7 +247,7 @@ class Report:
 
     def _first_data(self, difference: Difference) -> dict[str, Any]:
         frames, row = self.comparison.place(difference)
-        a, b = self._pair(difference)
+        a, b = self.pair(difference)
         return {
             "kind": difference.kind,
             "message": _message(frames.frame(row)),
@@ -259,6 +260,28 @@ class Report:
             "signals": [each._asdict() for each in signal_rows(a, b, self.comparison.ignore)],
             "before": [_line(frames.frame(each)) for each in self.before(difference)],
         }
+
+
+class FrameLine(NamedTuple):
+    """A frame that differs, in one line."""
+
+    time_s: float
+    kind: Kind
+    text: str
+
+
+def frame_lines(report: Report, limit: int) -> list[FrameLine]:
+    """The first frames that differ, with their times and what either side says."""
+    lines = []
+    for difference in report.comparison.differences[:limit]:
+        frames, row = report.comparison.place(difference)
+        a, b = report.pair(difference)
+        rows = signal_rows(a, b, report.comparison.ignore)
+        apart = " ".join(f"{each.name}={each.a}|{each.b}" for each in rows if each.differs)
+        told = apart or frame_text(frames.frame(row)).partition(" ")[2]
+        text = f"{moment(frames.time_s[row])}  can{frames.channel[row]} {_message(frames.frame(row))}  {told}"
+        lines.append(FrameLine(float(frames.time_s[row]), difference.kind, text))
+    return lines
 
 
 def _call(side: str, names: Sequence[str]) -> str:

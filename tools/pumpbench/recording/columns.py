@@ -58,12 +58,12 @@ def log_run(recording: Any, trace: Trace, frames: Frames, metrics: Mapping[str, 
         frames: every frame of it.
         metrics: content of metrics.json.
     """
-    logger = _Logger(recording)
+    logger = _Run(recording)
     logger.run(trace, frames)
     logger.properties(trace.info, metrics or {})
 
 
-class _Logger:
+class Logger:
     """Writes columns under entity paths."""
 
     def __init__(self, recording: Any) -> None:
@@ -72,18 +72,8 @@ class _Logger:
         self.rr = rr
         self.recording = recording
 
-    def run(self, trace: Trace, frames: Frames) -> None:
-        end_s = max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
-        self.glucose(trace, end_s)
-        self.drugs(trace)
-        self.stomach(trace)
-        self.lanes(trace, end_s)
-        self.log(trace)
-        self.bus(trace, frames)
-        for number, closeup in enumerate(close_ups(trace), 1):
-            self.document(f"closeup/{number}", closeup.text(trace))
-
     def send(self, path: str, time_s: Array, columns: Any) -> None:
+        """Columns of components at these simulated seconds."""
         self.recording.send_columns(path, indexes=[self.rr.TimeColumn(TIMELINE, duration=time_s)], columns=columns)
 
     def scalars(self, path: str, time_s: Array, values: Array, *, gaps: bool = True) -> bool:
@@ -106,6 +96,7 @@ class _Logger:
         *,
         step: bool = False,
     ) -> None:
+        """A series drawn as a line; `step` holds each value until the next one."""
         if self.scalars(path, trace.time_s, values):
             mode = (
                 self.rr.components.InterpolationMode.StepAfter if step else self.rr.components.InterpolationMode.Linear
@@ -123,9 +114,44 @@ class _Logger:
         marker: str = "circle",
         size: float = 2.0,
     ) -> None:
+        """A series drawn as markers; missing values are left out."""
         if self.scalars(path, time_s, values, gaps=False):
             style = self.rr.SeriesPoints(names=name, colors=[colour], markers=[marker], marker_sizes=[size])
             self.recording.log(path, style, static=True)
+
+    def document(self, path: str, markdown: str) -> None:
+        """A page of text, for the whole recording."""
+        self.recording.log(path, self.rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+
+    def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, tuple[int, int, int]]) -> None:
+        """A lane: when each state begins (simulated s) and its name, "" for a gap; colours by name."""
+        if not changes:
+            return
+        times, names = zip(*changes, strict=True)
+        shown = sorted({name for name in names if name})
+        self.recording.log(
+            path,
+            self.rr.StateConfiguration(
+                values=shown, labels=shown, colors=[colours.get(name, hue(name)) for name in shown]
+            ),
+            static=True,
+        )
+        self.send(path, np.array(times), self.rr.StateChange.columns(state=list(names)))
+
+
+class _Run(Logger):
+    """Logs all there is of a run."""
+
+    def run(self, trace: Trace, frames: Frames) -> None:
+        end_s = max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
+        self.glucose(trace, end_s)
+        self.drugs(trace)
+        self.stomach(trace)
+        self.lanes(trace, end_s)
+        self.log(trace)
+        self.bus(trace, frames)
+        for number, closeup in enumerate(close_ups(trace), 1):
+            self.document(f"closeup/{number}", closeup.text(trace))
 
     def properties(self, info: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
         flat = {key: value for key, value in info.items() if isinstance(value, str | int | float)}
@@ -138,9 +164,6 @@ class _Logger:
         ]
         if parts:
             self.document("run", "\n".join(parts))
-
-    def document(self, path: str, markdown: str) -> None:
-        self.recording.log(path, self.rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def glucose(self, trace: Trace, end_s: float) -> None:
         for limit, colour in ((70.0, RED), (180.0, ORANGE)):
@@ -208,20 +231,6 @@ class _Logger:
                 lanes.setdefault(lane, []).append((alarm.time_s, alarm.state))
         for lane, changes in lanes.items():
             self.states(lane, changes, tints.get(lane, {}))
-
-    def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, tuple[int, int, int]]) -> None:
-        if not changes:
-            return
-        times, names = zip(*changes, strict=True)
-        shown = sorted({name for name in names if name})
-        self.recording.log(
-            path,
-            self.rr.StateConfiguration(
-                values=shown, labels=shown, colors=[colours.get(name, hue(name)) for name in shown]
-            ),
-            static=True,
-        )
-        self.send(path, np.array(times), self.rr.StateChange.columns(state=list(names)))
 
     def log(self, trace: Trace) -> None:
         lines = notes(trace)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,17 +36,38 @@ def write_recording(trace: Trace, frames: Frames, path: Path, metrics: Mapping[s
     from pumpbench.recording.layout import blueprint  # noqa: PLC0415
 
     scene = Scene.of(trace, frames)
+
+    def fill(recording: Any) -> None:
+        recording.send_recording_name(title(trace.info))
+        recording.send_property(PROPERTY, rr.AnyValues(json=scene.as_json()))
+        log_run(recording, trace, frames, metrics)
+
+    write_stream(path, _recording_id(trace, frames), blueprint(scene), fill)
+
+
+def write_stream(path: Path, recording_id: str, look: Any, fill: Callable[[Any], None]) -> None:
+    """Write an .rrd file, compacted and verified.
+
+    Args:
+        path: the file; overwritten.
+        recording_id: the viewer joins recordings of one id.
+        look: its blueprint.
+        fill: logs everything into a `rerun.RecordingStream`.
+
+    Raises:
+        RecordingError: Rerun could not write the file or does not accept it.
+    """
+    import rerun as rr  # noqa: PLC0415
+
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".recording-") as directory:
         raw, final = Path(directory) / "raw.rrd", Path(directory) / "recording.rrd"
         strict = rr.strict_mode()
         rr.set_strict_mode(True)  # else a value Rerun does not like is only a warning, and missing
         try:
-            with rr.RecordingStream(APPLICATION, recording_id=_recording_id(trace, frames)) as recording:
-                recording.save(raw, default_blueprint=blueprint(scene))
+            with rr.RecordingStream(APPLICATION, recording_id=recording_id) as recording:
+                recording.save(raw, default_blueprint=look)
                 rr.set_log_time_enabled(False, recording=recording)
-                recording.send_recording_name(title(trace.info))
-                recording.send_property(PROPERTY, rr.AnyValues(json=scene.as_json()))
-                log_run(recording, trace, frames, metrics)
+                fill(recording)
                 recording.flush(timeout_sec=60)
         except (RuntimeError, TypeError, ValueError) as error:
             raise RecordingError(f"Rerun could not write {path.name}: {error}") from error
