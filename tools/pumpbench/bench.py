@@ -36,6 +36,8 @@ from pumpbench.trace import AlarmEvent, Signal, Trace, labels, signals
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from pumpbench.replay import Replay
+
 STEPS_PER_HOUR = 3600 // STEP_SECONDS
 STROKE_SLACK = 1e-9
 
@@ -100,6 +102,23 @@ def run(
             outcome.write(out, overwrite=request.overwrite)
         return outcome
     return Outcome.load(rig.execute(prepared))
+
+
+def replay(run: Path | Outcome, **keys: Any) -> Replay:
+    """Feed what a recorded device heard into a firmware, without a plant; see `pumpbench.replay.replay`.
+
+    Args:
+        run: a run folder, a log in candump format, or what came of a run.
+        keys: bus, firmware, ignore, keep_going, timeout, connect_timeout, reset_hook.
+
+    Returns:
+        The outcome, to be held to the record with `assert_same`.
+    """
+    from pumpbench.comparison.record import Record  # noqa: PLC0415
+    from pumpbench.replay import replay as play  # noqa: PLC0415
+
+    record = Record(run.title, run.frames, run.info) if isinstance(run, Outcome) else Record.load(Path(run))
+    return play(record, **keys)
 
 
 def frame_text(frame: Frame) -> str:

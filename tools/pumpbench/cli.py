@@ -545,7 +545,8 @@ def _status(error: Exception) -> int | None:
     wrong |= RecordError | ReplayError
     if isinstance(error, wrong):
         return EXIT_USAGE
-    if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
+    dead = ClusterError | LoopError | NodeDied | MemberSilent | PlantError | RecordingError | can.CanError | OSError
+    if isinstance(error, dead):
         return EXIT_DEAD
     return None
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pumpbench.cli_diff import IGNORE, RECORDS
+from pumpbench.cli_diff import IGNORE, OUT, RECORDS
 from pumpbench.terminal import EXIT_DEAD, EXIT_WRONG, console, progress_bar
 
 
@@ -28,10 +28,12 @@ def replay(
     timeout: Annotated[float, typer.Option(help="Seconds to wait for the end of a turn.", min=0.05)] = 5.0,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the first answer.", min=0.1)] = 10.0,
     reset_hook: Annotated[str | None, typer.Option(help="Command that resets a device that runs by itself.")] = None,
+    out: Annotated[Path | None, typer.Option(help=OUT)] = None,
     json_file: Annotated[str | None, typer.Option("--json", help="Write the report to this file; - is stdout.")] = None,
 ) -> None:
     """Feed what a recorded device heard into a firmware. Exit status 1 if it answers otherwise, 3 if not at all."""
     from pumpbench import replay as replays  # noqa: PLC0415
+    from pumpbench.comparison import folder  # noqa: PLC0415
     from pumpbench.files import write_file  # noqa: PLC0415
 
     with progress_bar() as bar:
@@ -46,11 +48,15 @@ def replay(
             reset_hook=reset_hook,
             progress=bar("turns"),
         )
+    if out is not None:
+        folder.write(outcome.report, out)
     if json_file == "-":
         typer.echo(outcome.json(), nl=False)
     else:
         if json_file is not None:
             write_file(Path(json_file), outcome.json().encode())
         console.print(outcome.text(), markup=False, soft_wrap=True)
+        if out is not None:
+            console.print(f"\n{folder.told(out)}", markup=False, soft_wrap=True)
     if not outcome.same:
         raise typer.Exit(EXIT_WRONG if outcome.silent is None else EXIT_DEAD)

@@ -21,6 +21,7 @@ import pytest
 if TYPE_CHECKING:
     from pumpbench.bench import Outcome
     from pumpbench.closeups import CloseUp
+    from pumpbench.replay import Replay
 
 SETTINGS = {
     "bus": ("inproc", "the bus of every run that names none: inproc, hub, socketcan:vcan0, slcan:/dev/ttyACM0@500000"),
@@ -72,6 +73,19 @@ class Bench:
         outcome = bench.run(**given)
         self._runs.append(outcome)
         return outcome
+
+    def replay(self, run: Path | Outcome, **keys: Any) -> Replay:
+        """What a recorded device heard, fed into the firmware that the command line names: `outcome.assert_same()`.
+
+        See `pumpbench.bench.replay`.
+        """
+        from pumpbench import bench  # noqa: PLC0415
+
+        defaults: dict[str, Any] = {"bus": _setting(self._config, "bus")}
+        firmware = _setting(self._config, "firmware")
+        if firmware:
+            defaults["firmware"] = firmware
+        return bench.replay(run, **(defaults | keys))
 
 
 @pytest.fixture

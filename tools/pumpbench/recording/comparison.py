@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from can_bus.lockstep import STEP_SECONDS
-from pumpbench.comparison import account
+from pumpbench.comparison.lanes import (
+    APART,
+    COLOURS,
+    KINDS,
+    PARTED,
+    WIDTHS,
+    message_lanes,
+    state_lanes,
+    words,
+)
 from pumpbench.comparison.report import Report, frame_lines
 from pumpbench.recording.columns import Logger
 from pumpbench.recording.file import write_stream
-from pumpbench.story import BLUE, GREY, ORANGE, RED, STATE_COLOURS, YELLOW, state_changes
+from pumpbench.story import GREY
+from pumpbench.summary import Lane
 from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
@@ -22,15 +32,15 @@ if TYPE_CHECKING:
 
     Array = NDArray[Any]
 
-COLOURS: Final = (BLUE, ORANGE)
-KINDS: Final = {"changed": RED, "missing": BLUE, "extra": ORANGE, "moved": GREY}
-"""Where only one of the runs has the frames, the lane has the colour of that run."""
+QUANTITIES: Final = (
+    ("insulin", "InsulinDelivered", True, "insulin delivered so far [U]"),
+    ("pramlintide", "PramDelivered", True, "pramlintide delivered so far [µg]"),
+    ("glucose", "TruthGlucose", False, "glucose [mg/dL]"),
+)
+"""Path, column of the trace, whether its differences add up, what it is."""
 
 CLOSE_S: Final = 3600.0
 """Shown before and behind the first difference in its close-up."""
-
-MAX_LANES: Final = 12
-"""Messages with a lane of their own; the report counts all of them."""
 
 MAX_LINES: Final = 20_000
 """Differing frames in the table."""
@@ -62,12 +72,24 @@ class _Scene:
         frames, row = (None, 0) if first is None else report.comparison.place(first)
         self.first_s = None if frames is None else float(frames.time_s[row])
         self.end_s = max([float(STEP_SECONDS), *(float(trace.time_s[-1]) for trace in self.traces if len(trace))])
-        self.stretches = account.stretches(report.comparison)
+        self.states, self.messages = state_lanes(report), message_lanes(report)
         self.dry = not any(
             np.nan_to_num(trace.get(name)).any()
             for trace in self.traces
             for name in ("PramRateCommanded", "PramBolusCommanded")
         )
+
+        self.apart = dict(self._apart())
+
+    def _apart(self) -> Iterator[tuple[str, tuple[Array, Array]]]:
+        a, b = self.traces
+        steps, in_a, in_b = np.intersect1d(a.step, b.step, return_indices=True)
+        for path, column, total, _ in QUANTITIES:
+            values = b.get(column)[in_b] - a.get(column)[in_a]
+            if total:
+                values = np.cumsum(np.nan_to_num(values))
+            if np.nan_to_num(values).any():
+                yield path, (steps * float(STEP_SECONDS), values)
 
     # ---- content
 
@@ -78,21 +100,17 @@ class _Scene:
         logger = Logger(recording)
         for limit in (70.0, 180.0):
             self._level(logger, f"glucose/limit_{limit:.0f}", limit)
-        for name, trace, colour in zip(names, self.traces, COLOURS, strict=True):
-            logger.line(f"glucose/true_{name}", trace, trace.get("TruthGlucose"), f"true, {name}", colour)
+        for name, trace, colour, width in zip(names, self.traces, map(_rgb, COLOURS), WIDTHS, strict=True):
+            logger.line(f"glucose/true_{name}", trace, trace.get("TruthGlucose"), f"true, {name}", colour, width)
             logger.points(f"glucose/cgm_{name}", trace.time_s, trace.get("GlucoseConc"), f"CGM, {name}", colour)
             for drug, folder, unit in (("Insulin", "insulin", "U"), ("Pram", "pramlintide", "µg")):
                 rate, bolus = trace.get(f"{drug}RateCommanded"), trace.get(f"{drug}BolusCommanded")
-                logger.line(f"{folder}/rate_{name}", trace, rate, f"rate, {name} [{unit}/h]", colour, step=True)
+                logger.line(f"{folder}/rate_{name}", trace, rate, f"rate, {name} [{unit}/h]", colour, width, step=True)
                 given = np.where(bolus > 0, bolus, np.nan)
                 logger.points(
                     f"{folder}/bolus_{name}", trace.time_s, given, f"bolus, {name} [{unit}]", colour, "diamond", 5.0
                 )
-            logger.line(f"iob/{name}", trace, trace.get("InsulinOnBoard"), name, colour)
-            for signal, message in (("CtrlState", "CTRL_Status"), ("PumpState", "PUMP_Status")):
-                changes = state_changes(trace, signal, message)
-                logger.states(f"state/{signal}_{name}", changes, STATE_COLOURS[signal])
-        self._apart(logger)
+        self._log_apart(logger)
         self._differences(logger)
         for path, (low, high) in self._ranges().items():
             self._mark(logger, f"{path}/first", low, high)
@@ -103,32 +121,25 @@ class _Scene:
         style = logger.rr.SeriesLines(names=f"limit {level:.0f}", colors=[GREY], widths=[1.0])
         logger.recording.log(path, style, static=True)
 
-    def _apart(self, logger: Logger) -> None:
+    def _log_apart(self, logger: Logger) -> None:
         """What the quantities are apart, and the doses have come to be."""
-        a, b = self.traces
-        steps, in_a, in_b = np.intersect1d(a.step, b.step, return_indices=True)
-        time_s = steps * float(STEP_SECONDS)
-        name = f"{self.report.names[1]} - {self.report.names[0]}"
-        for path, column, total, text in APART:
-            values = b.get(column)[in_b] - a.get(column)[in_a]
-            if total:
-                values = np.cumsum(np.nan_to_num(values))
-            if np.isnan(values).all():
-                continue
-            logger.send(f"apart/{path}", time_s, logger.rr.Scalars.columns(scalars=values))
-            style = logger.rr.SeriesLines(names=f"{text}, {name}", colors=[YELLOW], widths=[2.0])
-            logger.recording.log(f"apart/{path}", style, static=True)
+        name = f"{self.report.names[1]} minus {self.report.names[0]}"
+        for path, (time_s, values) in self.apart.items():
+            logger.send(f"apart/{path}/all", time_s, logger.rr.Scalars.columns(scalars=values))
+            style = logger.rr.SeriesLines(names=name, colors=[_rgb(APART)], widths=[2.0])
+            logger.recording.log(f"apart/{path}/all", style, static=True)
 
     def _differences(self, logger: Logger) -> None:
-        words = dict(zip(KINDS, ("differs", *(f"only {name}" for name in self.report.names), "moved"), strict=True))
-        colours = {words[kind]: colour for kind, colour in KINDS.items()}
-        for number, (message, runs) in enumerate([*self.stretches.items()][:MAX_LANES], 1):
-            changes: list[tuple[float, str]] = []
-            for run in runs:
-                if changes and changes[-1][0] == run.start_s:
-                    changes.pop()
-                changes += [(run.start_s, words[run.kind]), (run.end_s, "")]
-            logger.states(f"differs/{number:02}_{message}", changes, colours)
+        named, colours = words(self.report), {kind: _rgb(colour) for kind, colour in KINDS.items()}
+        for folder, lanes in (("state", self.states), ("differs", self.messages)):
+            for number, lane in enumerate(lanes, 1):
+                changes: list[tuple[float, str]] = []
+                for bar in sorted(lane.bars):
+                    if changes and changes[-1][0] == bar.start_s:
+                        changes.pop()
+                    changes += [(bar.start_s, bar.text), (bar.end_s, "")]
+                path = f"{folder}/{number:02}_{lane.name.replace(', ', '_').replace(' ', '_')}"
+                logger.states(path, changes, {bar.text: _rgb(bar.colour) for bar in lane.bars})
         lines = frame_lines(self.report, MAX_LINES)
         if lines:
             logger.send(
@@ -136,8 +147,8 @@ class _Scene:
                 np.array([line.time_s for line in lines]),
                 logger.rr.TextLog.columns(
                     text=[line.text for line in lines],
-                    level=[words[line.kind] for line in lines],
-                    color=[colours[words[line.kind]] for line in lines],
+                    level=[named[line.kind] for line in lines],
+                    color=[colours[line.kind] for line in lines],
                 ),
             )
 
@@ -147,7 +158,12 @@ class _Scene:
             return
         ends = np.array([self.first_s, self.first_s + 1e-6])
         logger.send(path, ends, logger.rr.Scalars.columns(scalars=np.array([low, high])))
-        style = logger.rr.SeriesLines(names="first difference", colors=[RED], widths=[1.5])
+        style = logger.rr.SeriesLines(
+            names="first difference",
+            colors=[_rgb(PARTED)],
+            widths=[1.5],
+            aggregation_policy=logger.rr.components.AggregationPolicy.Off,  # else the viewer makes one point of the two
+        )
         logger.recording.log(path, style, static=True)
 
     # ---- looks
@@ -174,11 +190,16 @@ class _Scene:
         plots.append(plot("Insulin commanded [U/h, U]", ["insulin/**"], ranges["insulin"], window))
         if not self.dry:
             plots.append(plot("Pramlintide commanded [µg/h, µg]", ["pramlintide/**"], ranges["pramlintide"], window))
-        plots += [plot(f"{self.report.names[1]} minus {self.report.names[0]}: {text}", [f"apart/{path}"], None, window)
-                  for path, _, _, text in APART if path != "pramlintide" or not self.dry]  # fmt: skip
-        shares = [3.0, 2.2, *([] if self.dry else [2.0]), *[1.4] * (len(plots) - (2 if self.dry else 3))]
-        lane_view = lanes("What differs, and states", ["differs/**", "state/**"], window)
-        left = rrb.Vertical(*plots, lane_view, row_shares=[*shares, 1.4 + 0.3 * min(len(self.stretches), MAX_LANES)])
+        difference = f"{self.report.names[1]} minus {self.report.names[0]}"
+        apart = [
+            plot(f"{difference}: {text}", [f"apart/{path}/**"], ranges[f"apart/{path}"], window)
+            for path, _, _, text in QUANTITIES
+            if f"apart/{path}" in ranges
+        ]
+        parts = [*plots, *([rrb.Tabs(*apart, active_tab=0)] if apart else [])]
+        parts += [lanes("States", ["state/**"], window), lanes("Messages that differ", ["differs/**"], window)]
+        shares = [3.4, 2.2, *([] if self.dry else [2.0]), *([1.7] if apart else []), self._share(self.states)]
+        left = rrb.Vertical(*parts, row_shares=[*shares, self._share(self.messages)])
         right = rrb.Vertical(
             rrb.TextDocumentView(name="What differs", origin="/report"),
             log("Frames that differ", "frames"),
@@ -186,24 +207,29 @@ class _Scene:
         )
         return rrb.Horizontal(left, right, column_shares=[56, 44], name=name)
 
+    @staticmethod
+    def _share(lanes: Sequence[Lane]) -> float:
+        return min(1.0 + 0.4 * len(lanes), 3.6)
+
     def _ranges(self) -> dict[str, tuple[float, float]]:
-        glucose = self._top(("TruthGlucose", "GlucoseConc"), 300.0)
-        return {
-            "glucose": (40.0, glucose + 20.0),
+        """The ends of the axes, which are those of the mark."""
+        ranges = {
+            "glucose": (40.0, self._top(("TruthGlucose", "GlucoseConc"), 300.0) + 20.0),
             "insulin": (0.0, 1.1 * self._top(("InsulinRateCommanded", "InsulinBolusCommanded"), 2.0)),
             "pramlintide": (0.0, 1.1 * self._top(("PramRateCommanded", "PramBolusCommanded"), 5.0)),
         }
+        for path, (_, values) in self.apart.items():
+            most = 1.1 * float(np.nanmax(np.abs(values)))
+            ranges[f"apart/{path}"] = (-most, most)
+        return ranges
 
     def _top(self, columns: Iterable[str], least: float) -> float:
         return max([least, *(_highest(trace, column) for trace in self.traces for column in columns)])
 
 
-APART: Final = (
-    ("glucose", "TruthGlucose", False, "glucose [mg/dL]"),
-    ("insulin", "InsulinDelivered", True, "insulin delivered so far [U]"),
-    ("pramlintide", "PramDelivered", True, "pramlintide delivered so far [µg]"),
-)
-"""Path, column of the trace, whether its differences add up, what it is."""
+def _rgb(colour: str) -> tuple[int, int, int]:
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
 
 
 def _highest(trace: Trace, column: str) -> float:
