@@ -174,11 +174,14 @@ class Report:
         return f"{_message(frames.frame(row))} at {when}, step {step}, {in_turn}, can{channel} ({BUSES[channel]})"
 
     def before(self, difference: Difference) -> list[int]:
-        """Positions of the frames before it on its bus, in the record that `Comparison.place` names."""
+        """Positions of the frames before it on its bus, in the record that `Comparison.place` names.
+
+        Without the plant's truth, which is for the record and causes nothing.
+        """
         frames, row = self.comparison.place(difference)
         earlier = np.flatnonzero(frames.channel[:row] == frames.channel[row])
-        kept = ~np.isin(frames.can_id[earlier], list(self.comparison.ignore.messages))
-        return [int(each) for each in earlier[kept][-BEFORE:]]
+        left_out = {*self.comparison.ignore.messages, codec.message("PLANT_Truth").can_id}
+        return [int(each) for each in earlier[~np.isin(frames.can_id[earlier], list(left_out))][-BEFORE:]]
 
     def pair(self, difference: Difference) -> tuple[Frame | None, Frame | None]:
         """The frame in A and in B."""
