@@ -131,22 +131,46 @@ def test_swapped_frames_are_moved_and_nothing_else(frames: Frames) -> None:
     assert kinds(comparison) == ["moved"]
 
 
+def diag_record(*, skipped: int = -1, lost: int = -1, anew: int = -1) -> Frames:
+    """40 steps of CTRL_Diag: one never said, one lost on its way, one from which on the sender counts from 0."""
+    tx, capture = Transmitter(), Capture()
+    for step in range(40):
+        if step == anew:
+            tx.counters["CTRL_Diag"] = 0
+        if step != skipped:
+            frame = tx.frame("CTRL_Diag", E2eErrorCount=step)
+            capture.extend(0, [frame] if step != lost else [])
+        capture.extend(0, [tx.frame("SYNC_Step", SyncPhase=Phase.STEP, StepIndex=step, SimTime=300 * step)])
+        capture.extend(0, [tx.frame("SYNC_Done", DoneStatus=0, DoneStepIndex=step, ExecTime=1, TxCount=1)])
+    return capture.finish()
+
+
 def test_a_sender_that_says_one_frame_less_counts_on_without_it() -> None:
     """What follows is renumbered, and the same."""
-
-    def record(skipped: int) -> Frames:
-        tx, capture = Transmitter(), Capture()
-        for step in range(40):
-            if step != skipped:
-                capture.extend(0, [tx.frame("CTRL_Diag", E2eErrorCount=step)])
-            capture.extend(0, [tx.frame("SYNC_Step", SyncPhase=Phase.STEP, StepIndex=step, SimTime=300 * step)])
-            capture.extend(0, [tx.frame("SYNC_Done", DoneStatus=0, DoneStepIndex=step, ExecTime=1, TxCount=1)])
-        return capture.finish()
-
-    comparison = compare(record(-1), record(17))
+    comparison = compare(diag_record(), diag_record(skipped=17))
     assert (kinds(comparison), comparison.renumbered) == (["missing"], 22)
-    comparison = compare(record(17), record(-1))
+    comparison = compare(diag_record(skipped=17), diag_record())
     assert (kinds(comparison), comparison.renumbered) == (["extra"], 22)
+
+
+def test_a_frame_lost_on_its_way_renumbers_nothing() -> None:
+    comparison = compare(diag_record(), diag_record(lost=17))
+    assert (kinds(comparison), comparison.renumbered) == (["missing"], 0)
+    comparison = compare(diag_record(), diag_record(skipped=17, lost=30))
+    assert (kinds(comparison), comparison.renumbered) == (["missing", "missing"], 21)
+
+
+def test_a_damaged_frame_among_renumbered_ones_is_a_difference_of_its_own() -> None:
+    less = diag_record(skipped=17)
+    row = row_of(less, "CTRL_Diag", 25)
+    comparison = compare(diag_record(), changed(less, row, bytes(8)))
+    assert (kinds(comparison), comparison.renumbered) == (["missing", "changed"], 21)
+
+
+def test_counters_that_agree_again_are_no_difference() -> None:
+    """Both senders start anew, one after it has said one frame less."""
+    comparison = compare(diag_record(anew=30), diag_record(skipped=17, anew=30))
+    assert (kinds(comparison), comparison.renumbered) == (["missing"], 12)
 
 
 def test_a_counter_that_jumps_without_a_reason_is_a_difference_once(frames: Frames) -> None:
