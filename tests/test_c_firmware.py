@@ -605,3 +605,12 @@ def test_the_variable_names_the_bus(build: Path) -> None:
     )
     assert done.returncode == BUS_LOST
     assert "unix:/nonexistent/hub: No such file" in done.stderr
+
+
+def test_its_record_is_answered_alike_by_both_firmwares(build: Path, runs: Path, pumpbench: Pumpbench) -> None:
+    firmware = f"{build / 'firmware'} {{bus}}"
+    done = pumpbench("run", *DAY, "--firmware", firmware, "--out", "recorded")
+    assert done.returncode == 0, done.stderr
+    for options in (("--firmware", firmware), ("--ignore", "own")):
+        done = pumpbench("replay", "recorded", *options)
+        assert done.returncode == 0, done.stdout + done.stderr
