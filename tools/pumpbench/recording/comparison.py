@@ -209,7 +209,7 @@ class _Scene:
 
     @staticmethod
     def _share(lanes: Sequence[Lane]) -> float:
-        return min(1.0 + 0.4 * len(lanes), 3.6)
+        return min(0.8 + 0.45 * len(lanes), 4.4)
 
     def _ranges(self) -> dict[str, tuple[float, float]]:
         """The ends of the axes, which are those of the mark."""
