@@ -13,6 +13,7 @@ from pumpbench import bench
 from pumpbench.capture import Capture, Frames, write_candump
 from pumpbench.comparison.account import partings, per_message, settings
 from pumpbench.comparison.align import Comparison, Ignore, compare
+from pumpbench.comparison.picture import write_picture
 from pumpbench.comparison.record import Record
 from pumpbench.comparison.report import Report, signal_rows
 from pumpbench.faults import drop
@@ -336,6 +337,13 @@ def test_a_comparison_is_kept_with_a_recording_and_a_picture(
     entities = {chunk.entity_path for chunk in RrdReader(kept / "comparison.rrd").stream()}
     assert {"/glucose/true_A", "/glucose/true_B", "/insulin/first", "/apart/insulin/all"} <= entities
     assert {"/state/01_firmware_A", "/state/02_firmware_B", "/differs/01_CGM_Reading", "/report"} <= entities
+
+
+def test_a_picture_of_many_days_is_drawn_too(tmp_path: Path) -> None:
+    runs = [bench.run(strategy="s2", scenario="validation-14d", hours=72, seed=seed) for seed in (1, 2)]
+    one, other = (Record(f"seed {seed}", run.frames, run.info) for seed, run in enumerate(runs, 1))
+    write_picture(Report(compare(one.frames, other.frames), one, other), tmp_path / "long.png")
+    assert (tmp_path / "long.png").read_bytes().startswith(b"\x89PNG")
 
 
 def damage(folder: Path, name: str, change: Callable[[str], str]) -> None:

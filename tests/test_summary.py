@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from pumpbench.capture import Capture
-from pumpbench.summary import FAULT, MAX_LINES, _alarm_lines, _binned, _headline, alarm_bars, write_summary
+from pumpbench.summary import FAULT, MAX_LINES, _alarm_lines, binned, _headline, alarm_bars, write_summary
 from pumpbench.trace import AlarmEvent, FaultEvent, Trace
 from synthetic_capture import Loop, dropping
 
@@ -106,6 +106,6 @@ def test_many_days_and_a_stretch_of_them(tmp_path: Path) -> None:
 
 def test_bins_are_means_over_what_is_known() -> None:
     values = np.array([1.0, 3.0, np.nan, 5.0, np.nan, np.nan, 7.0, 99.0])  # the last instant leads nowhere
-    edges, means = _binned(300.0 * np.arange(8), values, 2)
+    edges, means = binned(300.0 * np.arange(8), values, 2)
     assert edges.tolist() == [0, 600, 1200, 1800, 2100]
     assert np.array_equal(means, [2.0, 5.0, np.nan, 7.0], equal_nan=True)

@@ -228,8 +228,8 @@ def _glucose(axis: Any, trace: Trace) -> None:
 def _drug(axis: Any, trace: Trace, drug: str, unit: str, colour: str, span_s: float) -> None:
     name = "insulin" if drug == "Insulin" else "pramlintide"
     every = 12 if span_s > LONG_RUN else 1
-    edges, delivered = _binned(trace.time_s, trace.basal_delivered(drug), every)
-    _, commanded = _binned(trace.time_s, trace.get(f"{drug}RateCommanded"), every)
+    edges, delivered = binned(trace.time_s, trace.basal_delivered(drug), every)
+    _, commanded = binned(trace.time_s, trace.get(f"{drug}RateCommanded"), every)
     axis.stairs(
         np.nan_to_num(delivered), edges, fill=True, color=DELIVERED, alpha=0.55, lw=0, label=f"delivered [{unit}/h]"
     )
@@ -242,7 +242,7 @@ def _drug(axis: Any, trace: Trace, drug: str, unit: str, colour: str, span_s: fl
     plasma = trace.get("TruthPramlintide")
     if drug == "Pram" and not np.isnan(plasma).all():
         other = axis.twinx()
-        edges, mean = _binned(trace.time_s, plasma, every)
+        edges, mean = binned(trace.time_s, plasma, every)
         other.plot(edges[:-1], mean, color=PLASMA, lw=1.0, ls=(0, (3, 1.5)), label="plasma [pmol/L], right")
         other.set_ylim(0, max(float(np.nanmax(plasma)), 1.0) * 1.18)
         other.tick_params(axis="y", colors=PLASMA, labelsize=8, pad=1)
@@ -277,7 +277,7 @@ def _boluses(axis: Any, trace: Trace, drug: str, unit: str, colour: str, *, labe
     return float(max(commanded.max(), delivered.max())) * 1.05
 
 
-def _binned(time_s: Array, values: Array, every: int) -> tuple[Array, Array]:
+def binned(time_s: Array, values: Array, every: int) -> tuple[Array, Array]:
     """Edges and means of bins of `every` steps, over the steps that lead somewhere (all but the last instant)."""
     values = values[:-1]
     if not len(values):
