@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from pumpbench.capture import Capture
-from pumpbench.summary import FAULT, MAX_LINES, _alarm_lines, binned, _headline, alarm_bars, write_summary
+from pumpbench.summary import FAULT, MAX_LINES, _alarm_lines, _headline, alarm_bars, binned, write_summary
 from pumpbench.trace import AlarmEvent, FaultEvent, Trace
 from synthetic_capture import Loop, dropping
 
