@@ -14,9 +14,9 @@ from pumpbench.cli_conformance import conformance
 from pumpbench.cli_diff import diff
 from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
+from pumpbench.cli_replay import replay
 from pumpbench.cli_report import report
 from pumpbench.cli_view import snapshot, view
-from pumpbench.cli_replay import replay
 from pumpbench.terminal import (
     EXIT_DEAD,
     EXIT_INTERRUPTED,
@@ -541,7 +541,6 @@ def _status(error: Exception) -> int | None:
     wrong |= (
         CalibrationError | ControllerModelError | ConvertError | HuntError | RecordingError | RigError | RunFolderError
     )
-    wrong |= RecordError
     wrong |= RecordError | ReplayError
     if isinstance(error, wrong):
         return EXIT_USAGE
