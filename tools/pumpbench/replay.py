@@ -33,7 +33,8 @@ from pumpbench.conformance.connect import connected
 from pumpbench.conformance.device import Device
 from pumpbench.conformance.driver import Bench, Silent, Violation
 from pumpbench.conformance.registry import Need
-from pumpbench.rig import SERIAL, SOMEBODY_ELSES, RigError
+from pumpbench.identity import SOMEBODY_ELSES
+from pumpbench.rig import SERIAL, RigError
 from pumpbench.trace import labels
 
 if TYPE_CHECKING:
