@@ -11,6 +11,7 @@ import pytest
 from conftest import Pumpbench
 from pumpbench import bench
 from pumpbench.capture import Capture, Frames, write_candump
+from pumpbench.comparison import folder
 from pumpbench.comparison.account import partings, per_message, settings
 from pumpbench.comparison.align import Comparison, Ignore, compare
 from pumpbench.comparison.picture import write_picture
@@ -346,8 +347,16 @@ def test_a_picture_of_many_days_is_drawn_too(tmp_path: Path) -> None:
     assert (tmp_path / "long.png").read_bytes().startswith(b"\x89PNG")
 
 
-def damage(folder: Path, name: str, change: Callable[[str], str]) -> None:
-    file = folder / name
+def test_a_recording_that_cannot_be_written_is_named(
+    frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pumpbench.recording.tool.rerun_binary", lambda: "/bin/false")
+    with pytest.raises(OSError, match=r"cannot write .*comparison\.rrd: rerun rrd optimize failed"):
+        folder.write(report(frames, frames), tmp_path)
+
+
+def damage(run: Path, name: str, change: Callable[[str], str]) -> None:
+    file = run / name
     file.write_text(change(file.read_text()))
 
 
@@ -362,8 +371,8 @@ def test_bad_input_is_one_line_and_exit_status_2(
 ) -> None:
     one = folders[0]
     broken = [tmp_path / name for name in ("changed", "no-log", "no-json")]
-    for folder in broken:
-        shutil.copytree(one, folder)
+    for copy in broken:
+        shutil.copytree(one, copy)
     damage(broken[0], "bus.log", one_bit)
     (broken[1] / "bus.log").unlink()
     damage(broken[2], "run.json", lambda text: text[:50])

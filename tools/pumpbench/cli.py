@@ -544,8 +544,7 @@ def _status(error: Exception) -> int | None:
     wrong |= RecordError | ReplayError
     if isinstance(error, wrong):
         return EXIT_USAGE
-    dead = ClusterError | LoopError | NodeDied | MemberSilent | PlantError | RecordingError | can.CanError | OSError
-    if isinstance(error, dead):
+    if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD
     return None
 

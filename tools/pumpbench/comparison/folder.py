@@ -18,16 +18,19 @@ def write(report: Report, out: Path) -> None:
     """Write all four into a folder, which is made; files of these names are replaced.
 
     Raises:
-        OSError: the disk is full, or the folder cannot be written.
-        RecordingError: Rerun could not write its file.
+        OSError: the disk is full, or the folder or Rerun's file in it cannot be written.
     """
     from pumpbench.comparison.picture import write_picture  # noqa: PLC0415
     from pumpbench.recording.comparison import write_comparison  # noqa: PLC0415
+    from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
 
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / TEXT, f"{report.text()}\n".encode())
     write_file(out / DATA, report.json().encode())
-    write_comparison(report, out / RECORDING)
+    try:
+        write_comparison(report, out / RECORDING)
+    except RecordingError as error:
+        raise OSError(f"cannot write {out / RECORDING}: {error}") from error
     write_picture(report, out / PICTURE)
 
 
