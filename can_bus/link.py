@@ -12,7 +12,7 @@ from typing import Protocol, Self
 
 import can
 
-from can_bus.frame import CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, Frame
+from can_bus.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, Frame
 
 
 class BusLost(can.CanOperationError):
@@ -64,8 +64,8 @@ class Link(Protocol):
 class Wanted:
     """A receive filter by standard identifiers, the same on every transport.
 
-    Data and remote frames with a wanted 11-bit identifier pass, error frames always pass, frames with a 29-bit
-    identifier never do.
+    Data and remote frames with a wanted identifier pass, also where the same number has come as a 29-bit identifier (a
+    device must see that somebody sends such), and error frames always do.
     """
 
     __slots__ = ("_ids", "identifiers")
@@ -74,7 +74,8 @@ class Wanted:
         self.identifiers = sorted(set(identifiers))
         if self.identifiers and not 0 <= self.identifiers[0] <= self.identifiers[-1] <= CAN_SFF_MASK:
             raise ValueError("filters are standard identifiers, 0 to 0x7FF")
-        self._ids = frozenset(self.identifiers) | frozenset(can_id | CAN_RTR_FLAG for can_id in self.identifiers)
+        dresses = (0, CAN_RTR_FLAG, CAN_EFF_FLAG, CAN_EFF_FLAG | CAN_RTR_FLAG)
+        self._ids = frozenset(can_id | dress for can_id in self.identifiers for dress in dresses)
 
     def select(self, frames: list[Frame]) -> list[Frame]:
         """Return the frames that pass, in order."""

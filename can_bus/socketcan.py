@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 
 import can
 
-from can_bus.frame import CAN_EFF_FLAG, CAN_SFF_MASK, RECORD_SIZE, Frame, pack, unpack
+from can_bus.frame import CAN_EFF_MASK, RECORD_SIZE, Frame, pack, unpack
 from can_bus.hub_link import SHORT, timeval
 from can_bus.link import BaseLink
 
@@ -66,7 +66,7 @@ class SocketcanLink(BaseLink):
         except PermissionError:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
         if wanted is not None:
-            rules = b"".join(struct.pack("=II", i, CAN_SFF_MASK | CAN_EFF_FLAG) for i in wanted.identifiers)
+            rules = b"".join(struct.pack("=II", i, CAN_EFF_MASK) for i in wanted.identifiers)
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, rules)
 
     def recv(self, timeout: float | None) -> list[Frame]:

@@ -9,7 +9,20 @@ from pathlib import Path
 import pytest
 from conftest import Pumpbench
 from pumpbench import bench
-from pumpbench.faults import Faults, drop, dump, duplicate, hang, kill, load, restart, set_value, slow_task
+from pumpbench.faults import (
+    Faults,
+    drop,
+    dump,
+    duplicate,
+    extended_id,
+    hang,
+    kill,
+    load,
+    remote_frame,
+    restart,
+    set_value,
+    slow_task,
+)
 from pumpbench.node import tear
 from pumpbench.runfolder import RunFolder
 from serial_cable import cable
@@ -35,6 +48,8 @@ MIXED = [
     slow_task(task=1, start="04:40", end="04:45"),
     duplicate("PUMP_BolusCmd"),
     set_value("CGM_Reading", "GlucoseConc", 350, start="05:00", end="05:10"),
+    extended_id("PUMP_Status", start="05:40", count=1),  # what no DBC has must be heard, or not, by all alike
+    remote_frame("PUMP_Status", start="05:45", count=1),
 ]
 RUN = ("run", "--strategy", "sma", "--scenario", "six-hours", "--days", "0.25")
 

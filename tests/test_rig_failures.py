@@ -190,8 +190,9 @@ def _children(pid: int) -> list[psutil.Process]:
         return []
 
 
-def test_full_disk_is_one_line_and_the_partial_folder_keeps_its_name(runs: Path) -> None:
-    """The disk is full for the recorder: its files may not grow beyond 200 kB."""
+@pytest.mark.parametrize("bus", ["hub", "inproc"])
+def test_full_disk_is_one_line_and_the_partial_folder_keeps_its_name(bus: str, runs: Path) -> None:
+    """The disk is full for whoever records: its files may not grow beyond 200 kB."""
     script = (
         "import resource, sys\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
@@ -200,7 +201,7 @@ def test_full_disk_is_one_line_and_the_partial_folder_keeps_its_name(runs: Path)
     )
     out = runs / "out"
     done = subprocess.run(
-        [sys.executable, "-c", script, "run", "--days", "2", "--out", str(out)],
+        [sys.executable, "-c", script, "run", "--days", "2", "--bus", bus, "--out", str(out)],
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     check(done, 3, "cannot write", out)

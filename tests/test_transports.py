@@ -436,9 +436,10 @@ def test_time_out_is_an_empty_list(rig: Rig) -> None:
 
 
 @on(ALL)
-def test_filters_pass_wanted_standard_ids_and_error_frames_only(rig: Rig) -> None:
+def test_filters_pass_wanted_numbers_and_error_frames_only(rig: Rig) -> None:
     passing = [Frame(0x100, b"a"), Frame(0x200 | CAN_RTR_FLAG, bytes(2)), Frame(0x200, b"")]
-    stopped = [Frame(0x101, b""), Frame(0x300, b""), Frame(CAN_EFF_FLAG | 0x100, b"x")]
+    passing += [Frame(CAN_EFF_FLAG | 0x100, b"x"), Frame(CAN_EFF_FLAG | CAN_RTR_FLAG | 0x200, bytes(1))]
+    stopped = [Frame(0x101, b""), Frame(0x300, b""), Frame(CAN_EFF_FLAG | 0x10000100, b"x")]
     errors = [] if rig.kind == "slcan" else [Frame(CAN_ERR_FLAG | 0x40, bytes(8))]
     sender, picky = rig.link(), rig.node(filters=[0x100, 0x200])
     picky.start(collect, 2 * len(passing) + len(errors))

@@ -533,7 +533,7 @@ def _status(error: Exception) -> int | None:
     from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
     from pumpbench.replay import ReplayError  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
-    from pumpbench.runfolder import RunFolderError  # noqa: PLC0415
+    from pumpbench.runfolder import NotWritten, RunFolderError  # noqa: PLC0415
 
     wrong = (
         CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
@@ -542,7 +542,7 @@ def _status(error: Exception) -> int | None:
         CalibrationError | ControllerModelError | ConvertError | HuntError | RecordingError | RigError | RunFolderError
     )
     wrong |= RecordError | ReplayError
-    if isinstance(error, wrong):
+    if isinstance(error, wrong) and not isinstance(error, NotWritten):
         return EXIT_USAGE
     if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
         return EXIT_DEAD

@@ -40,6 +40,10 @@ class RunFolderError(OSError):
         super().__init__(text)
 
 
+class NotWritten(RunFolderError):
+    """The disk has failed or is full in the middle of it; the text says where what there is of the run is."""
+
+
 class RunFolder:
     """A run folder being written, or one that was read back.
 
@@ -99,7 +103,7 @@ class RunFolder:
             trace: the decoded run, if the caller already has it.
 
         Raises:
-            RunFolderError: a file could not be written (a full disk); what was written stays in `<out>.partial`.
+            NotWritten: a file could not be written (a full disk); what was written stays in `<out>.partial`.
         """
         from pumpbench.recording.file import write_recording  # noqa: PLC0415
         from pumpbench.summary import write_summary  # noqa: PLC0415
@@ -119,7 +123,7 @@ class RunFolder:
         """Write what there is of a run that was cut off; the folder keeps its name with `.partial`.
 
         Raises:
-            RunFolderError: a file could not be written.
+            NotWritten: a file could not be written.
         """
         info = self._info(frames, info, complete=False)
         self._write(RUN, lambda path: _dump(info, path))
@@ -145,7 +149,7 @@ class RunFolder:
             reason = (
                 f"the disk is full ({free // 1024} KiB free)" if full else getattr(error, "strerror", "") or str(error)
             )
-            raise RunFolderError(
+            raise NotWritten(
                 f"cannot write {name}: {reason}; what there is of the run is in {self.partial}"
             ) from error
 
