@@ -149,9 +149,7 @@ class RunFolder:
             reason = (
                 f"the disk is full ({free // 1024} KiB free)" if full else getattr(error, "strerror", "") or str(error)
             )
-            raise NotWritten(
-                f"cannot write {name}: {reason}; what there is of the run is in {self.partial}"
-            ) from error
+            raise NotWritten(f"cannot write {name}: {reason}; what there is of the run is in {self.partial}") from error
 
     def _rename(self) -> None:
         old = None
