@@ -25,7 +25,7 @@ from .pump import NMT_BOOT_UP, NMT_OPERATIONAL, REPORT, Pump, PumpSettings
 from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
 from .sensor import Sensor, SensorSettings
 from .sensors.effects import Effect
-from .user import User
+from .user import Plan, User
 
 _log = logging.getLogger("plant_server.server")
 
@@ -36,6 +36,9 @@ GLUCOSE_UNKNOWN, RATE_UNKNOWN = 8191, -1024
 """CGM_Reading.GlucoseConc and GlucoseRate SNA."""
 
 ALARM_PENDING = 1
+
+MODE_SEQUENCES = 255
+"""MODE_Cmd.ModeCmdSeq runs from 0 to 254."""
 
 VERSION_UNKNOWN = 63
 """CTRL_Info.CtrlProtocolMajor and CtrlProtocolMinor SNA."""
@@ -77,6 +80,12 @@ class Run(NamedTuple):
     sensor: str | SensorSettings = "coloured"
     variability: tuple[str, ...] = tuple(physiology.SOURCES)
     faults: tuple[AnyPumpFault | Effect, ...] = ()  # of the pump, and of the sensor besides its own effects
+    changes: tuple[Plan, ...] = ()  # of mode and scenario, in order of time
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Mode and scenario, from instant 0 on and after every change."""
+        return (Plan(0, self.mode, self.scenario), *self.changes)
 
 
 def stated_version(info: Mapping[str, int]) -> tuple[int, int] | None:
@@ -154,7 +163,10 @@ class PlantServer:
         sensor_faults = tuple(fault for fault in run.faults if isinstance(fault, Effect))
         self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name, sensor_faults)
         self.pump = Pump(PumpSettings(basal_milliunits_per_h=round(run.patient.basal_u_per_h * 1000)))
-        self._user = User(run.scenario, run.mode, run.seed, run.patient.name)
+        self._user = User(run.plans, run.seed, run.patient.name)
+        self._mode = run.mode
+        self._mode_asked = 0  # at this instant
+        self._mode_commands = 1
         self._outbox: list[Frame] = []
         self._echoes: dict[int, int] = {}
         self._version: tuple[int, int] | None = None  # of the protocol the device was built for
@@ -237,8 +249,8 @@ class PlantServer:
             return []
         if values["DoneStatus"] == Done.CONTINUE:
             return self._next_turn()
-        if self.step == 0 and self._mode_seen != self.run.mode:
-            raise PlantError(f"CTRL did not take up mode {_mode_name(self.run.mode)}: {self._mode_found()}")
+        if self.step == self._mode_asked and self._mode_seen != self._mode:
+            raise PlantError(f"CTRL did not take up mode {_mode_name(self._mode)}: {self._mode_found()}")
         self._advance()
         return self._open_step()
 
@@ -290,6 +302,7 @@ class PlantServer:
         self._outbox = []
         frames += self._confirm_pump_alarms()
         frames += self._fail_on_purpose()
+        frames += self._switch_mode()
         if not last:
             frames += self._user.announce(self.step, self._patient.rescued, self._transmitter)
         frames += self.pump.report_alarms(self._transmitter)
@@ -365,6 +378,16 @@ class PlantServer:
                 )
             )
 
+    def _switch_mode(self) -> list[Frame]:
+        """Ask for the mode that a change of plan brings."""
+        mode = next((plan.mode for plan in self.run.changes if plan.step == self.step), self._mode)
+        if mode == self._mode:
+            return []
+        self._mode, self._mode_asked, self._mode_seen = mode, self.step, None
+        number = self._mode_commands % MODE_SEQUENCES
+        self._mode_commands += 1
+        return [self._transmitter.frame("MODE_Cmd", ModeRequest=mode, ModeCmdSeq=number, SuspendRequest=0)]
+
     def _fail_on_purpose(self) -> list[Frame]:
         """Let the pump's faults act, and tell."""
         if not self._pump_faults:
@@ -433,10 +456,12 @@ class _Body:
         self._x = run.patient.x0.copy()
         self._variability = Variability(run.seed, run.patient.name, run.variability)
         self._p = self._variability.apply(self._nominal)
-        self._meals = run.scenario.meals_by_step()
-        self._rescuer = Rescuer(run.scenario.rescue) if run.scenario.rescue else None
+        scenario = run.plans[-1].scenario
+        self._meals = scenario.meals_by_step()
+        self._rules = {plan.step: plan.scenario.rescue for plan in run.plans}
+        self._rescuer: Rescuer | None = None
         self._carbs = np.zeros((run.steps, mechanism.SUBSTEPS))  # mg eaten in every 30-s step of the run
-        for meal in run.scenario.meals:
+        for meal in scenario.meals:
             self._eat(meal, EATING_MINUTES)
         self._meal_index = 0
         self.rescued: Meal | None = None  # sugar eaten at this instant
@@ -449,6 +474,9 @@ class _Body:
 
     def feel(self, step: int) -> None:
         """Eat sugar at this instant if glucose has been low for long enough."""
+        rule = self._rules.get(step)
+        if step in self._rules and rule != (self._rescuer and self._rescuer.rule):
+            self._rescuer = None if rule is None else Rescuer(rule)
         carbs = self._rescuer.carbs(step, self.glucose) if self._rescuer else 0.0
         self.rescued = None
         if carbs:

@@ -1,6 +1,8 @@
 """The user between the meals and the device: tells of each meal until the device has heard it."""
 
 from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
@@ -17,23 +19,34 @@ PATIENCE = 12
 SAMPLE_MINUTES = 5
 
 
+class Plan(NamedTuple):
+    """What holds from a sampling instant on, until the next plan does."""
+
+    step: int
+    mode: int  # CtrlMode
+    scenario: Scenario  # the whole one; its meals before `step` are those of the plan before
+
+
 class User:
     """Announces the meals of a run, one at a time, each repeated in every step until it is echoed.
 
     Args:
-        scenario: meals and habits.
-        mode: CtrlMode; decides what is told at all.
+        plans: in order of time, the first from instant 0 on; the mode decides what is told at all.
         seed: of the run.
         patient: name of the virtual patient.
     """
 
-    def __init__(self, scenario: Scenario, mode: int, seed: int, patient: str) -> None:
-        self._scenario = scenario
-        self._policy = policy_of(mode)
-        self._planned = deque(announcements(scenario, self._policy, seed, patient))
+    def __init__(self, plans: Sequence[Plan], seed: int, patient: str) -> None:
+        self._plans = deque(plans)
+        self._take_up(self._plans.popleft())
+        self._planned = deque(_announcements(plans, seed, patient))
         self._waiting: deque[Announcement] = deque()  # due, the first one is being told
         self._number = 0  # MealId of the first one
         self._since: int | None = None
+
+    def _take_up(self, plan: Plan) -> None:
+        self._scenario = plan.scenario
+        self._policy = policy_of(plan.mode)
 
     def hear(self, last_meal: int) -> None:
         """The device has echoed a MealId."""
@@ -47,6 +60,8 @@ class User:
 
     def announce(self, step: int, rescued: Meal | None, transmitter: Transmitter) -> list[Frame]:
         """What is told in instant `step`; `rescued` is sugar that was eaten just now."""
+        while self._plans and self._plans[0].step <= step:
+            self._take_up(self._plans.popleft())
         while self._planned and self._planned[0].step <= step:
             self._waiting.append(self._planned.popleft())
         sugar = None if rescued is None else rescue_announcement(self._scenario, self._policy, rescued)
@@ -62,3 +77,16 @@ class User:
         offset = min(max((meal.meal_step - step) * SAMPLE_MINUTES, -OFFSET_MAX), OFFSET_MAX)
         carbs = {} if meal.carbs_g is None else {"CarbsEst": round(meal.carbs_g * 2)}
         return [transmitter.frame("MEAL_Announce", MealKind=meal.kind, MealId=self._number, MealOffset=offset, **carbs)]
+
+
+def _announcements(plans: Sequence[Plan], seed: int, patient: str) -> list[Announcement]:
+    """What each plan tells while it holds; a meal to come that should have been told of before is told of at once."""
+    told: list[Announcement] = []
+    for plan, following in zip(plans, [*plans[1:], None], strict=True):
+        known = {each.meal_step for each in told}
+        for each in announcements(plan.scenario, policy_of(plan.mode), seed, patient):
+            overdue = each.step < plan.step <= each.meal_step and each.meal_step not in known
+            step = plan.step if overdue else each.step
+            if plan.step <= step and (following is None or step < following.step):
+                told.append(each._replace(step=step))
+    return sorted(told, key=lambda each: each.step)

@@ -11,7 +11,7 @@ from plant_server.scenario import RESCUE, Meal, Scenario, load_scenario
 from plant_server.scenarios.announcing import Announcing, Late
 from plant_server.scenarios.rescue import Rescue
 from plant_server.server import PlantServer, Run
-from plant_server.user import PATIENCE, User
+from plant_server.user import PATIENCE, Plan, User
 
 PATIENT = load_patient("adult#001")
 ESTIMATED, SIMPLE, SNACK, HYPO = 1, 2, 3, 4
@@ -110,7 +110,11 @@ def test_an_offset_is_kept_within_an_hour() -> None:
 
 def test_sugar_is_told_at_once_behind_what_is_being_told() -> None:
     eaten = scenario((3, "Lunch", 45.0), rescue=Rescue(announced=True))
-    user, transmitter, receiver = User(eaten, MODES["ma"], 1, "adult#001"), Transmitter(), Receiver(["MEAL_Announce"])
+    user, transmitter, receiver = (
+        User([Plan(0, MODES["ma"], eaten)], 1, "adult#001"),
+        Transmitter(),
+        Receiver(["MEAL_Announce"]),
+    )
 
     def tell(step: int, sugar: bool) -> list[tuple[int, int, int, int]]:
         rescued = Meal(step, RESCUE, 15.0) if sugar else None
@@ -137,7 +141,11 @@ def test_sugar_that_is_eaten_in_a_run_is_told() -> None:
 
 def test_meal_ids_wrap_below_their_reserved_code() -> None:
     eaten = scenario(*((k, "Lunch", 45.0) for k in range(257)))
-    user, transmitter, receiver = User(eaten, MODES["ma"], 1, "adult#001"), Transmitter(), Receiver(["MEAL_Announce"])
+    user, transmitter, receiver = (
+        User([Plan(0, MODES["ma"], eaten)], 1, "adult#001"),
+        Transmitter(),
+        Receiver(["MEAL_Announce"]),
+    )
     numbers = []
     for step in range(257):
         (frame,) = user.announce(step, None, transmitter)

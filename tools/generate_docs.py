@@ -403,7 +403,7 @@ def faults() -> str:
 
 
 def _kind(kind: str) -> str:
-    shared = {"start", "end", "message", "when", "nth", "every", "probability", "seed", "count"}
+    shared = {"start", "end", "message", "when", "nth", "every", "probability", "seed", "count", "place"}
     own = [f"`{name}`: {text}" for name, text in catalogue.parameters(kind).items() if name not in shared]
     rows = [
         (entry.name, f"`{as_flow(entry.fault)}`", ", ".join(entry.hazards), entry.noticed)

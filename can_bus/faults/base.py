@@ -30,6 +30,8 @@ class Fault(BaseModel):
     kind: str
     start: Time = 0
     end: Time | None = None
+    place: Annotated[int, Field(ge=0)] | None = None
+    """In the list, as its random numbers see it; None: where it stands. A fork takes faults out and leaves the rest."""
 
     @model_validator(mode="after")
     def _interval(self) -> "Fault":

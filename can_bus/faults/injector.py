@@ -66,7 +66,10 @@ class Injector:
     """
 
     def __init__(self, faults: Sequence[Fault]) -> None:
-        seeds = [f"{index} {fault.kind} {getattr(fault, 'seed', 0)}" for index, fault in enumerate(faults)]
+        places = [index if fault.place is None else fault.place for index, fault in enumerate(faults)]
+        seeds = [
+            f"{place} {fault.kind} {getattr(fault, 'seed', 0)}" for place, fault in zip(places, faults, strict=True)
+        ]
         self._memories = [Memory(seed) for seed in seeds]
         self._by_id: dict[int, list[tuple[FrameFault, Memory]]] = {}
         self._on_bus: list[tuple[BusFault, Memory]] = []

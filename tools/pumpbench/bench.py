@@ -25,11 +25,13 @@ from can_bus import codec
 from can_bus.faults import clock, seconds
 from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS
+from pumpbench import fork as forks
 from pumpbench import rig
 from pumpbench.capture import Capture, Frames
 from pumpbench.faults import Faults
 from pumpbench.identity import stated
 from pumpbench.outcome import measure
+from pumpbench.rewind import join
 from pumpbench.runfolder import RunFolder
 from pumpbench.trace import AlarmEvent, Signal, Trace, labels, signals
 
@@ -76,12 +78,9 @@ def run(
         RigError, PatientError, ScenarioError, SensorError, FileError: what is wrong with the arguments.
         NodeDied, MemberSilent, PlantError, BusLost: the run did not come to its end.
     """
-    folder = out
-    if folder is None and bus != "inproc":
-        folder = Path(tempfile.mkdtemp(prefix="pumpbench-run-")) / "run"
     request = rig.Request(
         patient=patient,
-        out=folder or Path("unwritten"),
+        out=out or _folder(bus),
         strategy=strategy,
         scenario=scenario,
         steps=round(hours * STEPS_PER_HOUR),
@@ -93,15 +92,94 @@ def run(
         firmware=firmware,
         **more,
     )
+    return _outcome(request, written=out is not None)
+
+
+def _outcome(request: rig.Request, *, written: bool) -> Outcome:
     prepared = rig.prepare(request)
-    if bus == "inproc":
-        capture = Capture()
-        rig.simulate(prepared, capture)
-        outcome = Outcome.of(capture.finish(), prepared.info | {"device": stated(capture.device_info())})
-        if out is not None:
-            outcome.write(out, overwrite=request.overwrite)
-        return outcome
-    return Outcome.load(rig.execute(prepared))
+    if request.bus != "inproc":
+        return Outcome.load(rig.execute(prepared))
+    capture = Capture()
+    rig.simulate(prepared, capture)
+    frames = capture.finish()
+    info = prepared.info | {"device": stated(capture.device_info())}
+    outcome = Outcome.of(join(request.origin, frames) if request.origin else frames, info)
+    if written:
+        outcome.write(request.out, overwrite=request.overwrite)
+    return outcome
+
+
+class Fork:
+    """An instant of a run, from which any number of others go on.
+
+    Args:
+        origin: the run, its folder, or that of a checkpoint.
+        at: the instant, "hh:mm" or "days+hh:mm"; a checkpoint has one of its own.
+
+    Raises:
+        ForkError: it is none of this run, or the run cannot be done again.
+        RunFolderError, CheckpointError: there is no such folder, or it was changed.
+    """
+
+    def __init__(self, origin: Outcome | Path, at: str | None = None) -> None:
+        if isinstance(origin, Path):
+            self.instant = forks.Instant.parse(str(origin) if at is None else f"{origin}@{at}")
+            return
+        if at is None:
+            raise forks.ForkError("say at which instant: only a checkpoint has one of its own")
+        info = {"trace_sha256": origin.frames.sha256(), **origin.info}
+        self.instant = forks.Instant.of(str(origin.folder or "the run"), origin.frames, info, at)
+
+    def run(
+        self,
+        *,
+        faults: Iterable[Any] | None = None,
+        strategy: str | None = None,
+        scenario: str | None = None,
+        hours: float | None = None,
+        firmware: str | None = None,
+        bus: str | None = None,
+        out: Path | None = None,
+        **more: Any,
+    ) -> Outcome:
+        """Go on to the end; what is not given stays as it was.
+
+        Args:
+            faults: instead of those that have not begun by the instant.
+            strategy, scenario, firmware: from the instant on.
+            hours: of the whole run.
+            bus: another one.
+            out: the run folder to write, as of `run`.
+            more: further fields of `pumpbench.rig.Request` about how it is done.
+
+        Raises:
+            ForkError: what is wrong with the arguments.
+            Diverged: the run did not begin as recorded.
+            NodeDied, MemberSilent, PlantError, BusLost: it did not come to its end.
+        """
+        bus = bus or self.instant.info["bus"]
+        request = forks.fork(
+            self.instant,
+            out or _folder(bus),
+            faults=None if faults is None else Faults.of(faults),
+            strategy=strategy,
+            scenario=scenario,
+            steps=None if hours is None else round(hours * STEPS_PER_HOUR),
+            firmware=firmware,
+            bus=bus,
+            **more,
+        )
+        return _outcome(request, written=out is not None)
+
+
+def fork(origin: Outcome | Path, at: str | None = None) -> Fork:
+    """An instant of a run, to go on from: `bench.fork(RUN, at="2+03:00").run(faults=[...])`."""
+    return Fork(origin, at)
+
+
+def _folder(bus: str) -> Path:
+    """Where a run goes when nobody has said."""
+    return Path("unwritten") if bus == "inproc" else Path(tempfile.mkdtemp(prefix="pumpbench-run-")) / "run"
 
 
 def replay(run: Path | Outcome, **keys: Any) -> Replay:

@@ -14,6 +14,7 @@ from pumpbench.cli_conformance import conformance
 from pumpbench.cli_diff import diff
 from pumpbench.cli_doctor import doctor
 from pumpbench.cli_faults import faults_command, hunt, matrix
+from pumpbench.cli_fork import checkpoint, forked
 from pumpbench.cli_replay import replay
 from pumpbench.cli_report import report
 from pumpbench.cli_view import snapshot, view
@@ -43,6 +44,7 @@ PHYSIOLOGIES = "Equations: S2008, or S2013 with counter-regulation (default: wha
 PRAMLINTIDE = "Parameter set: P2, P4, moderate, conservative or strong; +type1 behind it for a lower bioavailability."
 RESET_HOOK = "Command that switches a real device, before the run and at its faults: run with cut, start kept, ..."
 RESET_LINE = "The same by a line of a serial port: dtr:PORT or rts:PORT, asserted = in reset."
+FROM = "Begin as this recorded run up to hh:mm or days+hh:mm; faults, strategy, ... then hold from there on."
 VARIABILITY = "What varies in the patient: all, none, or a comma list of k_abs, f, insulin_pk, circadian."
 
 
@@ -73,6 +75,7 @@ def _common(
 
 @app.command()
 def run(
+    context: typer.Context,
     patient: Annotated[str, typer.Option(help=PATIENTS)] = "adult#001",
     strategy: Annotated[Strategy, typer.Option(help="Mode of the controller.")] = Strategy.S2,
     scenario: Annotated[str, typer.Option(help=SCENARIOS)] = "validation-14d",
@@ -102,6 +105,7 @@ def run(
     pramlintide: Annotated[str, typer.Option(help=PRAMLINTIDE)] = "P2",
     variability: Annotated[str, typer.Option(help=VARIABILITY)] = "all",
     controller: Annotated[Path | None, typer.Option(help="Controller models, by identify-controller.")] = None,
+    origin: Annotated[str | None, typer.Option("--from", metavar="RUN@TIME", help=FROM)] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder to write (default: below runs/).")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing run folder at --out.")] = False,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware's first answer.")] = 20.0,
@@ -111,6 +115,22 @@ def run(
     from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
     from pumpbench import rig  # noqa: PLC0415
 
+    if origin is not None:
+        requests = [
+            forked(
+                context,
+                origin,
+                out,
+                device_bus=device_bus,
+                reset_hook=reset_hook,
+                reset_line=reset_line,
+                overwrite=overwrite or out is None,
+                connect_timeout=connect_timeout,
+                step_timeout=step_timeout,
+            )
+        ]
+        _run(requests)
+        return
     names = _patients(patient)
     varying = rig.variability_sources(variability)
     requests = [
@@ -140,6 +160,12 @@ def run(
         )
         for name in names
     ]
+    _run(requests)
+
+
+def _run(requests: list[Any]) -> None:
+    from pumpbench import rig  # noqa: PLC0415
+
     prepared = [rig.prepare(request) for request in requests]
     folders = _execute(prepared)
     hazards = _print_outcomes(folders)
@@ -480,6 +506,7 @@ app.command()(report)
 app.command()(diff)
 app.command()(replay)
 app.command()(doctor)
+app.command()(checkpoint)
 app.command()(view)
 app.command()(snapshot)
 
@@ -525,26 +552,29 @@ def _status(error: Exception) -> int | None:
     from plant_server.server import PlantError  # noqa: PLC0415
     from pumpbench.calibration import CalibrationError  # noqa: PLC0415
     from pumpbench.campaign import CampaignError, ClusterError  # noqa: PLC0415
+    from pumpbench.checkpoint import CheckpointError  # noqa: PLC0415
     from pumpbench.closed_loop import CaseError, LoopError  # noqa: PLC0415
     from pumpbench.comparison.record import RecordError  # noqa: PLC0415
     from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
     from pumpbench.convert import ConvertError  # noqa: PLC0415
+    from pumpbench.fork import ForkError  # noqa: PLC0415
     from pumpbench.hunt import HuntError  # noqa: PLC0415
     from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
     from pumpbench.replay import ReplayError  # noqa: PLC0415
+    from pumpbench.rewind import Diverged  # noqa: PLC0415
     from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
     from pumpbench.runfolder import NotWritten, RunFolderError  # noqa: PLC0415
 
     wrong = (
         CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
     )
-    wrong |= (
-        CalibrationError | ControllerModelError | ConvertError | HuntError | RecordingError | RigError | RunFolderError
-    )
-    wrong |= RecordError | ReplayError
+    wrong |= CalibrationError | CheckpointError | ControllerModelError | ConvertError | ForkError | HuntError
+    wrong |= RecordError | RecordingError | ReplayError | RigError | RunFolderError
     if isinstance(error, wrong) and not isinstance(error, NotWritten):
         return EXIT_USAGE
-    if isinstance(error, ClusterError | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError):
+    if isinstance(
+        error, ClusterError | Diverged | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError
+    ):
         return EXIT_DEAD
     return None
 

@@ -47,6 +47,11 @@ class InProcess:
         self.firmware: Firmware = Firmware(self._memory)
         self.said: list[Frame] = []  # by a firmware that has just started
 
+    @property
+    def memory(self) -> bytes:
+        """All of the non-volatile memory."""
+        return self._memory.read(0, self._memory.size)
+
     def cut(self) -> None:
         """The gateway lets nothing in or out any more; what is in RAM is forgotten at the start."""
 

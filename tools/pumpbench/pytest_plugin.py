@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from pumpbench.bench import Outcome
+    from pumpbench.bench import Fork, Outcome
     from pumpbench.closeups import CloseUp
     from pumpbench.replay import Replay
 
@@ -86,6 +86,38 @@ class Bench:
         if firmware:
             defaults["firmware"] = firmware
         return bench.replay(run, **(defaults | keys))
+
+    def fork(self, origin: Outcome | Path, at: str | None = None) -> BenchFork:
+        """An instant of a run, to go on from on the same bus and with the same firmware; see `pumpbench.bench.Fork`."""
+        return BenchFork(self, origin, at)
+
+    def forked(self, origin: Fork, keys: dict[str, Any]) -> Outcome:
+        """A continuation."""
+        given = {"bus": _setting(self._config, "bus")} | keys
+        firmware, device_bus = _setting(self._config, "firmware"), _setting(self._config, "device-bus")
+        if firmware and firmware != origin.instant.info["firmware"]:
+            given.setdefault("firmware", firmware)
+        if device_bus:
+            given.setdefault("device_bus", device_bus)
+        if given["bus"] != "inproc":
+            given.setdefault("out", self._folder / f"run-{len(self._runs)}")
+        outcome = origin.run(**given)
+        self._runs.append(outcome)
+        return outcome
+
+
+class BenchFork:
+    """An instant of a run on a `Bench`."""
+
+    def __init__(self, bench: Bench, origin: Outcome | Path, at: str | None = None) -> None:
+        from pumpbench.bench import Fork  # noqa: PLC0415
+
+        self._bench = bench
+        self._fork = Fork(origin, at)
+
+    def run(self, **keys: Any) -> Outcome:
+        """Go on to the end; see `pumpbench.bench.Fork.run`."""
+        return self._bench.forked(self._fork, keys)
 
 
 @pytest.fixture

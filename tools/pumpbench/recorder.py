@@ -22,8 +22,9 @@ from can_bus import codec
 from can_bus.link import BusLost, Link
 from can_bus.lockstep import Phase
 from can_bus.url import BusUrlError, open_link
-from pumpbench.capture import Capture
+from pumpbench.capture import Capture, read_candump
 from pumpbench.identity import stated
+from pumpbench.rewind import Diverged, Origin, join
 from pumpbench.runfolder import RunFolder
 
 COALESCE_SECONDS = 0.005
@@ -84,11 +85,14 @@ def listen(links: Sequence[Link], capture: Capture, *, free_running: bool = Fals
     return True
 
 
-def write(folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete: bool) -> None:
+def write(
+    folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete: bool, origin: Origin | None = None
+) -> None:
     """Analyse what was collected and write the run folder; an incomplete run keeps its `.partial` name.
 
     Raises:
         RunFolderError: the folder could not be written.
+        Diverged: the run did not begin as its origin did; it keeps its `.partial` name too.
     """
     from pumpbench.outcome import measure  # noqa: PLC0415
     from pumpbench.trace import Trace  # noqa: PLC0415
@@ -98,6 +102,12 @@ def write(folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete
     if not complete:
         folder.write_partial(frames, info)
         return
+    if origin is not None:
+        try:
+            frames = join(origin, frames)
+        except Diverged:
+            folder.write_partial(frames, info)
+            raise
     trace = Trace.from_frames(frames, info)
     folder.write_all(frames, info, measure(trace, frames), trace)
 
@@ -113,6 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--plant-bus", metavar="URL", help="the plant's bus, when a gateway lies between")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="the run folder to write")
     parser.add_argument("--info", type=Path, metavar="FILE", help="JSON to be merged into run.json")
+    parser.add_argument("--origin", type=Path, metavar="LOG", help="a recorded run that this one begins with")
+    parser.add_argument("--origin-step", type=int, default=0, metavar="K", help="the instant up to which it does")
+    parser.add_argument("--firmware-since", type=int, metavar="K", help="the instant from which this firmware answers")
     parser.add_argument("--free-running", action="store_true", help="the device answers no token")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing run folder")
     options = parser.parse_args(arguments)
@@ -122,10 +135,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.ExitStack() as stack:
         try:
             info = json.loads(options.info.read_text(encoding="utf-8")) if options.info else {}
+            origin = None
+            if options.origin is not None:
+                origin = Origin(read_candump(options.origin), options.origin_step, options.firmware_since)
             folder = RunFolder.create(options.out, overwrite=options.overwrite)
             urls = [options.bus, *([options.plant_bus] if options.plant_bus else [])]
             links = [stack.enter_context(open_link(url)) for url in urls]
-        except (BusUrlError, OSError, can.CanError, json.JSONDecodeError) as error:
+        except (BusUrlError, OSError, can.CanError, ValueError) as error:
             return _failed(error, 2)
         print("ready", flush=True)
         try:
@@ -134,8 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write(folder, capture, info, complete=False)
             return _failed(error, 3)
         try:
-            write(folder, capture, info, complete=complete)
-        except (OSError, ValueError) as error:
+            write(folder, capture, info, complete=complete, origin=origin)
+        except (OSError, ValueError, Diverged) as error:
             return _failed(error, 3)
     return 0
 

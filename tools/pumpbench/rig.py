@@ -26,29 +26,31 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, NamedTuple, TypedDict
 
-from can_bus.faults import Hang, MemoryState, NodeControl, NodeFault, Restart
+from can_bus.faults import Hang, MemoryState, NodeControl, NodeFault, Restart, clock
 from can_bus.frame import Frame
 from can_bus.gateway import Gateway, Side
 from can_bus.hub import Hub
 from can_bus.link import Link
-from can_bus.lockstep import STEPS_PER_DAY, Node
+from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Node
 from can_bus.node_control import CommandControl, LineControl, attend
 from can_bus.url import open_link
 from plant_server.free_run import FreePlant, serve_free
 from plant_server.physiology import SOURCES, Patient, load_patient
-from plant_server.scenario import load_scenario
-from plant_server.sensor import load_sensor
+from plant_server.scenario import Scenario, load_scenario
+from plant_server.sensor import SensorSettings, load_sensor
 from plant_server.sensors.ideal import Ideal
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
+from plant_server.user import Plan
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
-from pumpbench.capture import Capture
+from pumpbench.capture import Capture, write_candump
 from pumpbench.controller_model import ControllerModel, ControllerModelError, read_models, shipped_models
 from pumpbench.faults import Faults, write_wire
 from pumpbench.faults import load as load_fault_file
 from pumpbench.identity import SOMEBODY_ELSES, firmware_sha256, versions
 from pumpbench.node import InProcess, Process
 from pumpbench.recorder import write
+from pumpbench.rewind import Origin, RewoundPlant
 from pumpbench.runfolder import RunFolder
 
 READY_SECONDS = 30.0
@@ -66,6 +68,14 @@ class RigError(ValueError):
 
 class NodeDied(RuntimeError):
     """A process of the run ended or failed; the text names it and repeats its last words."""
+
+
+class Change(NamedTuple):
+    """What holds from a sampling instant on."""
+
+    step: int
+    strategy: str
+    scenario: str
 
 
 @dataclass(frozen=True)
@@ -93,6 +103,8 @@ class Request:
     controller: Path | None = None  # models of patients of one's own; None: those of the package
     model: ControllerModel | None = None  # one that is at hand, instead
     tuning: Tuning | None = None  # None: that of the strategy
+    origin: Origin | None = None  # a recorded run that it begins with
+    changes: tuple[Change, ...] = ()  # of strategy and scenario on the way
     overwrite: bool = False
     connect_timeout: float = 20.0
     step_timeout: float = 10.0
@@ -132,8 +144,9 @@ def prepare(request: Request) -> Prepared:
         RigError, PatientError, ScenarioError, SensorError, ControllerModelError, CalibrationError, FileError: what is
             wrong with the request.
     """
-    if request.strategy not in MODES:
-        raise RigError(f"there is no strategy {request.strategy!r}; choose one of {', '.join(MODES)}")
+    for strategy in (request.strategy, *(change.strategy for change in request.changes)):
+        if strategy not in MODES:
+            raise RigError(f"there is no strategy {strategy!r}; choose one of {', '.join(MODES)}")
     if request.steps < 1:
         raise RigError("a run has at least one step of 5 min")
     if request.seed < 0:
@@ -142,23 +155,21 @@ def prepare(request: Request) -> Prepared:
         raise RigError("--bus inproc runs the built-in firmware only; a --firmware command needs a bus, e.g. --bus hub")
     variability = variability_sources(",".join(request.variability) or "none")
     patient = load_patient(request.patient, physiology=request.physiology, pramlintide=request.pramlintide)
-    scenario = load_scenario(
-        request.scenario, seed=request.seed, patient=patient.name, days=request.steps / STEPS_PER_DAY
-    )
-    if request.steps > scenario.days * STEPS_PER_DAY:
-        raise RigError(
-            f"scenario {scenario.name} has {scenario.days} days, asked for {request.steps / STEPS_PER_DAY:g}"
-        )
+    scenario = _scenario(request.scenario, request, patient)
+    changes = _plans(request, scenario, patient)
     faults = load_fault_file(request.faults) if isinstance(request.faults, Path) else request.faults or Faults()
-    model = request.model or controller_model(request.patient, patient, request.controller)
     sensor = load_sensor(request.sensor)
-    tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
-    calibration = calibrate(patient, tuning, model)
+    if request.origin is not None:
+        calibration = request.origin.calibration()
+    else:
+        model = request.model or controller_model(request.patient, patient, request.controller)
+        tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
+        calibration = calibrate(patient, tuning, model)
     _check_speed(request)
     _check_switch(request, [fault for fault in faults.wire if isinstance(fault, NodeFault)])
     mode = MODES[request.strategy]
     injected = faults.pump + faults.sensor
-    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, injected)
+    run = Run(patient, scenario, request.steps, request.seed, mode, calibration, sensor, variability, injected, changes)
     PlantServer(run).rehearse()  # checks the rest, and loads compiled code before anybody waits on a bus
     info = {
         **versions(),
@@ -168,6 +179,7 @@ def prepare(request: Request) -> Prepared:
         "variability": list(variability),
         "strategy": request.strategy,
         "scenario": scenario.name,
+        **({"scenario_file": request.scenario} if request.scenario != scenario.name else {}),
         "days": request.steps / STEPS_PER_DAY,
         "steps": request.steps,
         "seed": request.seed,
@@ -178,14 +190,77 @@ def prepare(request: Request) -> Prepared:
         **({"reset": request.reset_hook or request.reset_line} if request.reset_hook or request.reset_line else {}),
         **({"free_running": True, "speed": request.speed, "reproducible": False} if request.free_running else {}),
         "faults": faults.as_json(),
+        **({"changes": _told(request, changes)} if changes else {}),
+        **({"fork": _fork(request.origin)} if request.origin else {}),
         "parameters": {
-            "patient_sha256": _sha256(patient.params.tobytes() + patient.x0.tobytes()),
-            "scenario_sha256": _sha256(repr((scenario.meals, scenario.announcing, scenario.rescue)).encode()),
-            "sensor_sha256": _sha256(repr(sensor).encode()),
+            "patient_sha256": patient_sha256(patient),
+            "scenario_sha256": scenario_sha256(scenario),
+            "sensor_sha256": sensor_sha256(sensor),
             "calibration_sha256": _sha256(repr(sorted(calibration.items())).encode()),
         },
     }
     return Prepared(request, run, faults, info)
+
+
+def _scenario(name: str, request: Request, patient: Patient) -> Scenario:
+    """A scenario that is long enough.
+
+    Raises:
+        RigError, ScenarioError: it is not, or there is none.
+    """
+    days = request.steps / STEPS_PER_DAY
+    scenario = load_scenario(name, seed=request.seed, patient=patient.name, days=days)
+    if request.steps > scenario.days * STEPS_PER_DAY:
+        raise RigError(f"scenario {scenario.name} has {scenario.days} days, asked for {days:g}")
+    return scenario
+
+
+def _plans(request: Request, scenario: Scenario, patient: Patient) -> tuple[Plan, ...]:
+    """The changes of a request; the meals before each are those of the scenario before it."""
+    name = request.scenario
+    plans = []
+    for change in request.changes:
+        if change.scenario != name:
+            name = change.scenario
+            other = _scenario(name, request, patient)
+            meals = [meal for meal in scenario.meals if meal.step < change.step]
+            meals += [meal for meal in other.meals if meal.step >= change.step]
+            scenario = other._replace(meals=tuple(meals))
+        plans.append(Plan(change.step, MODES[change.strategy], scenario))
+    return tuple(plans)
+
+
+def _told(request: Request, plans: Sequence[Plan]) -> list[dict[str, Any]]:
+    """The changes of a request for run.json."""
+    return [
+        {"at": clock(change.step * STEP_SECONDS), **change._asdict(), "scenario_sha256": scenario_sha256(plan.scenario)}
+        for change, plan in zip(request.changes, plans, strict=True)
+    ]
+
+
+def _fork(origin: Origin) -> dict[str, Any]:
+    """Where a run comes from, for run.json."""
+    return {
+        "of": origin.info.get("trace_sha256"),
+        "at": clock(origin.step * STEP_SECONDS),
+        "step": origin.step,
+        **({"firmware_since": origin.since} if origin.since is not None else {}),
+    }
+
+
+def patient_sha256(patient: Patient) -> str:
+    """Hash over a patient's parameters, as in run.json; so for the others."""
+    return _sha256(patient.params.tobytes() + patient.x0.tobytes())
+
+
+def scenario_sha256(scenario: Scenario) -> str:
+    """Hash over meals and habits."""
+    return _sha256(repr((scenario.meals, scenario.announcing, scenario.rescue)).encode())
+
+
+def sensor_sha256(sensor: SensorSettings) -> str:
+    """Hash over a sensor's settings."""
+    return _sha256(repr(sensor).encode())
 
 
 def _check_speed(request: Request) -> None:
@@ -343,7 +418,7 @@ def _in_process(prepared: Prepared, folder: RunFolder) -> Path:
     request = prepared.request
     capture = Capture()
     simulate(prepared, capture)
-    write(folder, capture, prepared.info, complete=True)
+    write(folder, capture, prepared.info, complete=True, origin=request.origin)
     return request.out
 
 
@@ -353,12 +428,43 @@ def simulate(prepared: Prepared, capture: Capture) -> None:
     Raises:
         NodeDied, PlantError: the run did not come to its end.
     """
+    wires(prepared, capture).run(prepared.request.progress)
+
+
+def wires(prepared: Prepared, capture: Capture, *, memory: bool = False) -> Wires:
+    """The nodes of a run in this process, joined.
+
+    Args:
+        prepared: the run.
+        capture: gets every frame.
+        memory: the firmware has a non-volatile memory, whether or not a fault needs one.
+    """
     from firmware_sim.firmware import Firmware  # noqa: PLC0415
 
-    wire = prepared.faults.wire
-    device: Node | InProcess = InProcess() if any(isinstance(fault, NodeFault) for fault in wire) else Firmware()
+    wire, origin = prepared.faults.wire, prepared.request.origin
+    memory |= origin is not None and origin.state is not None  # which has one
+    memory |= any(isinstance(fault, NodeFault) for fault in wire)
+    device: Node | InProcess = InProcess() if memory else Firmware()
     gateway = Gateway(wire, device if isinstance(device, InProcess) else None) if wire else None
-    Wires(PlantServer(prepared.run), device, gateway, capture).run(prepared.request.progress)
+    return Wires(_plant(prepared, gateway, device), device, gateway, capture)
+
+
+def _plant(prepared: Prepared, gateway: Gateway | None = None, device: Node | InProcess | None = None) -> PlantServer:
+    """The plant of a run; with the nodes of this process that a checkpoint says something about."""
+    origin = prepared.request.origin
+    if origin is None:
+        return PlantServer(prepared.run)
+    plant = RewoundPlant(prepared.run, origin)
+    stored = origin.state
+    if stored is not None:
+        from pumpbench import checkpoint  # noqa: PLC0415
+
+        other_faults = prepared.info["faults"] != origin.info["faults"]
+        mine = device if isinstance(device, InProcess) else None
+        plant.arrived = lambda: checkpoint.check(
+            stored, checkpoint.state(plant, gateway, mine), other_faults=other_faults
+        )
+    return plant
 
 
 # ---- processes on a bus
@@ -597,7 +703,7 @@ def _processes(prepared: Prepared) -> Path:
             if request.free_running:
                 serve_free(FreePlant(prepared.run), link, speed=request.speed, **options)
             else:
-                serve(PlantServer(prepared.run), link, **options)
+                serve(_plant(prepared), link, **options)
         except Exception:
             watch()  # a dead node is the better explanation
             raise
@@ -655,6 +761,12 @@ def _start_recorder_side(
     command += ["--free-running"] if prepared.request.free_running else []
     if buses.shown != buses.plant:
         command += ["--plant-bus", buses.plant]
+    origin = prepared.request.origin
+    if origin is not None:
+        log = place / "origin.log"
+        write_candump(origin.frames, log)
+        command += ["--origin", str(log), "--origin-step", str(origin.step)]
+        command += ["--firmware-since", str(origin.since)] if origin.since is not None else []
     return start("recorder", command, ready=True)
 
 
