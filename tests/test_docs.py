@@ -1,7 +1,7 @@
 """What README and docs tell a reader to type does what they say: run here, with its output where the page shows it.
 
-Every `sh` block of a page is a script, every `console` block a dialogue whose answers must come as printed (`...`
-stands for anything). A page is one session: what a command leaves behind is there for the next one.
+A `yaml` block that begins with its name is a file, an `sh` block a script, a `console` block a dialogue whose answers must
+come as printed (`...` stands for anything). A page is one session: what a command leaves behind is there for the next one.
 """
 
 import os
@@ -162,6 +162,8 @@ def test_a_page_is_a_session_that_works(page: str, desk: Path) -> None:
     place = desk / (Path(page).parent if page.startswith("examples/") else "")
     for block in blocks(page):
         where = f"{page}:{block.line}"
+        if block.language == "yaml" and (name := re.match(r"# (\w+\.yaml)$", block.text, re.MULTILINE)):
+            (place / name[1]).write_text(block.text, encoding="utf-8")
         if block.language == "sh":
             for command in filter(is_run, lines(block)):
                 done = bash(command, place)
