@@ -115,7 +115,7 @@ def test_a_fault_file(tmp_path: Path) -> None:
         (
             'faults:\n  - kind: drop\n    message: CGM_Reading\n    strat: "02:00"\n',
             4,
-            r"faults\.0\.strat: unknown key; expected one of kind, start, end, message, when, nth, ",
+            r"faults\.0\.strat: unknown key; expected one of kind, start, end, place, message, when, nth, ",
         ),
         ("faults:\n  - {message: CGM_Reading}\n", 2, r"faults\.0: expected a mapping with the key kind"),
         ("faults:\n  - {kind: xyz}\n", 2, r"there is no kind 'xyz'; there are drop, delay, .*"),
