@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -32,7 +33,7 @@ from can_bus.frame import (
     Frame,
     pack,
 )
-from can_bus.lockstep import STEP_SECONDS
+from can_bus.lockstep import STEP_SECONDS, Done
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,6 +73,14 @@ class Frames:
     def __len__(self) -> int:
         return len(self.can_id)
 
+    @classmethod
+    def none(cls) -> Frames:
+        """No frames at all."""
+        kinds = ("u1", "u4", "u1", "u1", "i4", "f8", "i2")
+        columns = [np.zeros(0, kind) for kind in kinds]
+        columns[3] = np.zeros((0, MAX_DATA), "u1")
+        return cls(*columns)
+
     @property
     def word(self) -> Array:
         """The payloads as little-endian 64-bit integers."""
@@ -80,6 +89,14 @@ class Frames:
     def select(self, rows: Array) -> Frames:
         """The frames chosen by a mask or an array of positions, in that order."""
         return Frames(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def at_step(self, step: int) -> Frames:
+        """The same frames, as if they belonged to another step."""
+        return replace(self, step=np.full_like(self.step, step))
+
+    def in_order(self) -> Frames:
+        """The same frames in canonical order; those of a step and channel stay as they are."""
+        return self.select(np.lexsort((self.channel, self.step)))
 
     def frame(self, row: int) -> Frame:
         """One frame as the bus carries it."""
@@ -109,10 +126,15 @@ class Frames:
 
 
 class Capture:
-    """Collects the frames of a run as they come: bytes in, analysis afterwards."""
+    """Collects the frames of a run as they come: bytes in, analysis afterwards.
 
-    def __init__(self) -> None:
+    Args:
+        keep: gets the channel and the packed records of every batch, e.g. to keep them on a disk.
+    """
+
+    def __init__(self, keep: Callable[[int, bytes], None] | None = None) -> None:
         self._buffers: dict[int, bytearray] = {}
+        self._keep = keep
 
     def __len__(self) -> int:
         return sum(map(len, self._buffers.values())) // _RECORD.itemsize
@@ -126,8 +148,15 @@ class Capture:
 
         Raises:
             ValueError: a frame has more than 8 data bytes.
+            OSError: `keep` could not; the batch is in memory all the same.
         """
-        self._buffers.setdefault(channel, bytearray()).extend(pack(frames))
+        self.extend_packed(channel, records := pack(frames))
+        if self._keep is not None:
+            self._keep(channel, records)
+
+    def extend_packed(self, channel: int, records: bytes) -> None:
+        """Append frames that are packed already (`can_bus.frame.pack`)."""
+        self._buffers.setdefault(channel, bytearray()).extend(records)
 
     def device_info(self) -> dict[str, int] | None:
         """Raw values of the device's CTRL_Info; None without one.
@@ -143,6 +172,65 @@ class Capture:
     def finish(self) -> Frames:
         """Put all frames collected so far into simulated time and canonical order; more may be appended afterwards."""
         return _canonical({channel: np.frombuffer(bytes(raw), _RECORD) for channel, raw in self._buffers.items()})
+
+
+class NewRun(Exception):
+    """The roll was called anew and another run has begun on the bus: what was heard before is no part of it.
+
+    Attributes:
+        taken: for each channel, how many frames of the whole record belong to the run before.
+    """
+
+    def __init__(self, taken: list[int]) -> None:
+        super().__init__("another run has begun on the bus")
+        self.taken = taken
+
+
+class Follower:
+    """Puts frames into simulated time while the run is still on, each once its step is over.
+
+    A step is over when the device has closed its last turn, or when the next one has begun. What `Capture.finish` says
+    of a frame is said here too, from the frames so far: only a window of them is looked at, back to the last step that
+    was over.
+    """
+
+    def __init__(self, channels: int) -> None:
+        """Args: channels: how many buses are recorded, the device's first."""
+        self._raw = [bytearray() for _ in range(channels)]
+        self._handed = [0] * channels  # of the frames in the window
+        self._before = [0] * channels  # frames that the window has left behind
+
+    def extend(self, channel: int, records: bytes) -> None:
+        """Append packed records as the bus showed them, whole ones."""
+        self._raw[channel] += records
+
+    def take(self, *, over: bool = False) -> Frames:
+        """The frames that were not handed out before and whose step is over on every bus, in canonical order.
+
+        Args:
+            over: nothing more will come; all that is left is handed out.
+
+        Raises:
+            NewRun: a new run has begun; a new follower has to begin behind the frames it names.
+        """
+        windows = [_place(np.frombuffer(bytes(raw), _RECORD)) for raw in self._raw]
+        for window, handed in zip(windows, self._handed, strict=True):
+            if not window.keep[:handed].all():
+                raise NewRun([sum(each) for each in zip(self._before, self._handed, strict=True)])
+        closed = min(window.closed for window in windows)
+        parts = []
+        for channel, window in enumerate(windows):
+            handed = len(window.step) if over else int(np.searchsorted(window.step, closed, side="right"))
+            rows = window.keep.copy()
+            rows[: self._handed[channel]] = rows[handed:] = False
+            parts.append(window.columns(channel, rows))
+            # behind the roll call, or the next window would take it for the start of another run
+            context = np.flatnonzero(window.keep & (window.step >= closed))
+            start = int(context[0]) if closed >= 0 and len(context) else 0
+            del self._raw[channel][: start * _RECORD.itemsize]
+            self._handed[channel] = max(handed, self._handed[channel]) - start
+            self._before[channel] += start
+        return _joined(parts)
 
 
 # --------------------------------------------------------------------------------------------- what the frames say
@@ -237,7 +325,7 @@ def _without_roll_call(can_id: Array, words: Array, tokens: list[_Token], done: 
     keep = np.ones(len(can_id), bool)
     phases = _phases()
     called, call, opening = -1, -1, len(can_id)
-    for token, following in zip(tokens, [*tokens[1:], None], strict=False):  # no token at all: nothing to look at
+    for token, following in itertools.zip_longest(tokens, tokens[1:]):
         if token.phase != phases["Init"]:
             continue
         if following is None:
@@ -277,8 +365,21 @@ def _turns(tokens: list[_Token], done: Array) -> list[_Token]:
     return turns
 
 
-def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Array, Array]:
-    """For one channel: which frames belong to the record, and their step, turn and time in microseconds."""
+class _Assigned(NamedTuple):
+    """For each frame of a channel: whether it belongs to the record, its step, its turn, its time in microseconds.
+
+    `closed` is the last step to which nothing more will be said, -1 for none.
+    """
+
+    keep: Array
+    step: Array
+    turn: Array
+    micros: Array
+    closed: int
+
+
+def _assign(can_id: Array, length: Array, data: Array) -> _Assigned:
+    """Read the lockstep of one channel."""
     words = np.ascontiguousarray(data).view("<u8").reshape(-1)
     good = _intact(can_id, length, data)
     tokens = _read_tokens(can_id, good, words)
@@ -290,7 +391,7 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
     count = len(can_id)
     if not turns:
         zeros = np.zeros(count, "i8")
-        return keep, zeros, zeros, np.arange(count) * FRAME_MICROSECONDS
+        return _Assigned(keep, zeros, zeros, np.arange(count) * FRAME_MICROSECONDS, -1)
 
     phases = _phases()
     starts = np.array([token.row for token in turns])
@@ -333,7 +434,18 @@ def _assign(can_id: Array, length: Array, data: Array) -> tuple[Array, Array, Ar
     kept = np.flatnonzero(keep)
     micros = np.zeros(count, "i8")
     micros[kept] = _microseconds(base_of[kept])
-    return keep, np.array(steps)[turn_of], np.array(numbers)[turn_of], micros
+    return _Assigned(keep, np.array(steps)[turn_of], np.array(numbers)[turn_of], micros, _closed(turns, done, words))
+
+
+def _closed(turns: list[_Token], done: Array, words: Array) -> int:
+    """The last step that is over: one that the device has closed, or one before the last token's."""
+    last = turns[-1]
+    if last.phase != _phases()["Config"]:  # the calibration is no step of its own
+        answers = words[done[done > last.row]]
+        steps, statuses = (_signal("SYNC_Done", name, answers) for name in ("DoneStepIndex", "DoneStatus"))
+        if any(said == last.step and status != Done.CONTINUE for said, status in zip(steps, statuses, strict=True)):
+            return last.step  # and no answer to a roll call
+    return max((token.step for token in turns if token.step < last.step), default=-1)
 
 
 def _batch_start(can_id: Array, start: int, limit: int) -> int:
@@ -353,30 +465,54 @@ def _microseconds(base_s: Array) -> Array:
     return micros
 
 
-def _canonical(records: dict[int, Array]) -> Frames:
-    parts: list[tuple[Array, ...]] = []
-    for channel in sorted(records):
-        record = records[channel]
-        can_id, length = record["can_id"].astype("u4"), record["length"].astype("u1")
-        # what no CAN bus can carry is written down as the nearest that it can, so that a log says the same
-        too_long = (can_id & ~np.uint32(CAN_RTR_FLAG) > CAN_SFF_MASK) & (can_id & _FLAGS == 0)
-        can_id[too_long] |= np.uint32(CAN_EFF_FLAG)
-        carried = (np.arange(MAX_DATA) < length[:, None]) & (can_id & CAN_RTR_FLAG == 0)[:, None]
-        data = record["data"].reshape(-1, MAX_DATA) * carried.astype("u1")
-        keep, step, turn, micros = _assign(can_id, length, data)
-        channels = np.full(int(keep.sum()), channel, "u1")
-        time_s = micros[keep] / 1e6
-        parts.append(
-            (channels, can_id[keep], length[keep], data[keep], step[keep].astype("i4"), time_s, turn[keep].astype("i2"))
+class _Window(NamedTuple):
+    """Frames of one channel as they came, with what `_assign` says of them."""
+
+    can_id: Array
+    length: Array
+    data: Array
+    keep: Array
+    step: Array
+    turn: Array
+    micros: Array
+    closed: int
+
+    def columns(self, channel: int, rows: Array) -> tuple[Array, ...]:
+        """The columns of `Frames` for the frames that a mask chooses."""
+        return (
+            np.full(int(rows.sum()), channel, "u1"),
+            self.can_id[rows],
+            self.length[rows],
+            self.data[rows],
+            self.step[rows].astype("i4"),
+            self.micros[rows] / 1e6,
+            self.turn[rows].astype("i2"),
         )
-    if not parts:
-        empty = np.zeros(0)
-        kinds = ("u1", "u4", "u1", "u1", "i4", "f8", "i2")
-        columns = [empty.astype(kind) for kind in kinds]
-        columns[3] = np.zeros((0, MAX_DATA), "u1")
-        return Frames(*columns)
-    frames = Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    return frames.select(np.lexsort((frames.channel, frames.step)))
+
+
+def _place(record: Array) -> _Window:
+    can_id, length = record["can_id"].astype("u4"), record["length"].astype("u1")
+    # what no CAN bus can carry is written down as the nearest that it can, so that a log says the same
+    too_long = (can_id & ~np.uint32(CAN_RTR_FLAG) > CAN_SFF_MASK) & (can_id & _FLAGS == 0)
+    can_id[too_long] |= np.uint32(CAN_EFF_FLAG)
+    carried = (np.arange(MAX_DATA) < length[:, None]) & (can_id & CAN_RTR_FLAG == 0)[:, None]
+    data = record["data"].reshape(-1, MAX_DATA) * carried.astype("u1")
+    return _Window(can_id, length, data, *_assign(can_id, length, data))
+
+
+def _canonical(records: dict[int, Array]) -> Frames:
+    windows = ((channel, _place(records[channel])) for channel in sorted(records))
+    return _joined([window.columns(channel, window.keep) for channel, window in windows])
+
+
+def _joined(parts: Sequence[tuple[Array, ...]]) -> Frames:
+    return concatenated([Frames(*columns) for columns in parts]).in_order()
+
+
+def concatenated(parts: Sequence[Frames]) -> Frames:
+    """These frames, one after the other."""
+    parts = parts or [Frames.none()]
+    return Frames(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Frames)))
 
 
 # ------------------------------------------------------------------------------------------------------ log files
