@@ -69,6 +69,11 @@ LANES: Final[tuple[tuple[str, str, str], ...]] = (
 )
 """State lanes: signal, message, what a reader calls it."""
 
+LINE_LANES: Final[tuple[tuple[str, str, str], ...]] = (
+    ("InsulinOcclusion", "PUMP_Status", "insulin_line"),
+    ("PramOcclusion", "PUMP_Status", "pramlintide_line"),
+)
+"""Lanes that are shown where something is wrong with a line."""
 
 PRIORITY_COLOURS: Final = {"High": RED, "Medium": ORANGE, "Low": YELLOW}
 
@@ -133,8 +138,13 @@ def without_reminders(alarms: Iterable[AlarmEvent]) -> list[AlarmEvent]:
     return found
 
 
-def notes(trace: Trace) -> list[Note]:
-    """What happened, in order of time: alarms, injected faults, meals, changes of the firmware's state."""
+def notes(trace: Trace, *, running: bool = False) -> list[Note]:
+    """What happened, in order of time: alarms, injected faults, meals, changes of the firmware's state.
+
+    Args:
+        trace: the run.
+        running: it is still on, so that nobody knows how long a fault will last.
+    """
     found = [
         Note(
             alarm.time_s,
@@ -146,8 +156,8 @@ def notes(trace: Trace) -> list[Note]:
         for alarm in without_reminders(trace.alarms)
     ]
     for span in trace.fault_spans():
-        minutes = round((span.end_s - span.start_s) / 60)
-        found.append(Note(span.start_s, "FAULT", f"{span.label} for {minutes} min", RED))
+        duration = "" if running else f" for {round((span.end_s - span.start_s) / 60)} min"
+        found.append(Note(span.start_s, "FAULT", f"{span.label}{duration}", RED))
     found += [Note(meal.time_s, "MEAL", f"{meal.carbs_g:.0f} g of carbohydrate", GREEN) for meal in trace.meals]
     for start, text in state_changes(trace, "CtrlState", "CTRL_Status"):
         if text:

@@ -22,6 +22,7 @@ from pumpbench.story import (
     GREEN,
     GREY,
     LANES,
+    LINE_LANES,
     ORANGE,
     PINK,
     PRIORITY_COLOURS,
@@ -30,12 +31,13 @@ from pumpbench.story import (
     STATE_COLOURS,
     TEAL,
     YELLOW,
+    Note,
     hue,
     notes,
     state_changes,
     without_reminders,
 )
-from pumpbench.trace import Trace, decode, signals
+from pumpbench.trace import FaultSpan, Trace, decode, signals
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     Array = NDArray[Any]
 
 TIMELINE: Final = "sim_time"
+Colour = tuple[int, int, int]
 LONG_RUN: Final = 2.5 * 86400
 """Simulated seconds from which on points and lines are thinner."""
 BIT_RATE: Final = 500_000
@@ -58,8 +61,10 @@ def log_run(recording: Any, trace: Trace, frames: Frames, metrics: Mapping[str, 
         frames: every frame of it.
         metrics: content of metrics.json.
     """
-    logger = _Run(recording)
+    logger = Run(recording)
     logger.run(trace, frames)
+    logger.tables(frames)
+    logger.close_ups(trace)
     logger.properties(trace.info, metrics or {})
 
 
@@ -72,6 +77,30 @@ class Logger:
         self.rr = rr
         self.recording = recording
 
+    # ---- what to send of what there is: all of it, unless the recording grows
+
+    def fresh(self, path: str, time_s: Array, known: Array) -> Array:
+        """Mask of the rows of a series to send."""
+        del path, time_s
+        return np.ones(len(known), bool)
+
+    def fresh_states(self, path: str, changes: list[tuple[float, str]]) -> list[tuple[float, str]]:
+        """The changes of a lane to send."""
+        del path
+        return changes
+
+    def palette(self, path: str, colours: dict[str, Colour]) -> dict[str, Colour]:
+        """The colours of a lane's states."""
+        del path
+        return colours
+
+    def style(self, path: str, what: Any, key: tuple[str, ...] = ()) -> None:
+        """How an entity looks; otherwise than before only if `key` is another one."""
+        del key
+        self.recording.log(path, what, static=True)
+
+    # ---- what there is
+
     def send(self, path: str, time_s: Array, columns: Any) -> None:
         """Columns of components at these simulated seconds."""
         self.recording.send_columns(path, indexes=[self.rr.TimeColumn(TIMELINE, duration=time_s)], columns=columns)
@@ -81,8 +110,9 @@ class Logger:
         known = ~np.isnan(values)
         if not known.any():
             return False
-        rows = slice(None) if gaps else known
-        self.send(path, time_s[rows], self.rr.Scalars.columns(scalars=values[rows]))
+        rows = self.fresh(path, time_s, known) & (known | gaps)
+        if rows.any():
+            self.send(path, time_s[rows], self.rr.Scalars.columns(scalars=values[rows]))
         return True
 
     def line(
@@ -91,7 +121,7 @@ class Logger:
         trace: Trace,
         values: Array,
         name: str,
-        colour: tuple[int, int, int],
+        colour: Colour,
         width: float = 2.0,
         *,
         step: bool = False,
@@ -102,7 +132,7 @@ class Logger:
                 self.rr.components.InterpolationMode.StepAfter if step else self.rr.components.InterpolationMode.Linear
             )
             style = self.rr.SeriesLines(names=name, colors=[colour], widths=[width], interpolation_mode=mode)
-            self.recording.log(path, style, static=True)
+            self.style(path, style)
 
     def points(
         self,
@@ -110,50 +140,73 @@ class Logger:
         time_s: Array,
         values: Array,
         name: str,
-        colour: tuple[int, int, int],
+        colour: Colour,
         marker: str = "circle",
         size: float = 2.0,
     ) -> None:
         """A series drawn as markers; missing values are left out."""
         if self.scalars(path, time_s, values, gaps=False):
             style = self.rr.SeriesPoints(names=name, colors=[colour], markers=[marker], marker_sizes=[size])
-            self.recording.log(path, style, static=True)
+            self.style(path, style)
 
     def document(self, path: str, markdown: str) -> None:
         """A page of text, for the whole recording."""
         self.recording.log(path, self.rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
-    def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, tuple[int, int, int]]) -> None:
+    def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, Colour]) -> None:
         """A lane: when each state begins (simulated s) and its name, "" for a gap; colours by name."""
+        palette = self.palette(path, {name: colours.get(name, hue(name)) for _, name in changes if name})
+        changes = self.fresh_states(path, changes)
         if not changes:
             return
         times, names = zip(*changes, strict=True)
-        shown = sorted({name for name in names if name})
-        self.recording.log(
-            path,
-            self.rr.StateConfiguration(
-                values=shown, labels=shown, colors=[colours.get(name, hue(name)) for name in shown]
-            ),
-            static=True,
-        )
+        shown = sorted(palette)
+        configuration = self.rr.StateConfiguration(values=shown, labels=shown, colors=[palette[name] for name in shown])
+        self.style(path, configuration, tuple(shown))
         self.send(path, np.array(times), self.rr.StateChange.columns(state=list(names)))
 
 
-class _Run(Logger):
+class Run(Logger):
     """Logs all there is of a run."""
 
+    # ---- what is known of it: how it ended, unless it is still on (`pumpbench.recording.live`)
+
+    def limit(self, path: str, trace: Trace, level: float) -> None:
+        """A horizontal line."""
+        self.send(path, np.array([0.0, _end_s(trace)]), self.rr.Scalars.columns(scalars=np.full(2, level)))
+
+    def is_over(self, span: FaultSpan, trace: Trace) -> bool:
+        """Whether the end of a fault is known."""
+        del span, trace
+        return True
+
+    def fresh_notes(self, trace: Trace) -> list[Note]:
+        """The lines of the log to send."""
+        return notes(trace)
+
+    def usual(self, lane: str, counts: Array) -> float | None:
+        """How many frames of a message a step has, as a rule; None if that can't be said yet."""
+        del lane
+        return float(np.median(counts))
+
+    # ---- what there is
+
     def run(self, trace: Trace, frames: Frames) -> None:
-        end_s = max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
-        self.glucose(trace, end_s)
+        """Everything but the raw frames and the close-ups."""
+        self.glucose(trace)
         self.drugs(trace)
         self.stomach(trace)
-        self.lanes(trace, end_s)
+        self.lanes(trace)
         self.log(trace)
         self.bus(trace, frames)
+
+    def close_ups(self, trace: Trace) -> None:
+        """What happened in each of them, as a page."""
         for number, closeup in enumerate(close_ups(trace), 1):
             self.document(f"closeup/{number}", closeup.text(trace))
 
     def properties(self, info: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
+        """What is known of the run as a whole."""
         flat = {key: value for key, value in info.items() if isinstance(value, str | int | float)}
         if flat:
             self.recording.send_property("run", self.rr.AnyValues(**flat))
@@ -165,20 +218,22 @@ class _Run(Logger):
         if parts:
             self.document("run", "\n".join(parts))
 
-    def glucose(self, trace: Trace, end_s: float) -> None:
-        for limit, colour in ((70.0, RED), (180.0, ORANGE)):
-            path = f"limits/{limit:.0f}"
-            self.send(path, np.array([0.0, end_s]), self.rr.Scalars.columns(scalars=np.full(2, limit)))
-            style = self.rr.SeriesLines(names=f"limit {limit:.0f}", colors=[colour], widths=[1.0])
-            self.recording.log(path, style, static=True)
-        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", GREY, 2.5 if end_s < LONG_RUN else 1.5)
+    def glucose(self, trace: Trace) -> None:
+        """Glucose, its measurement, limits and meals."""
+        for level, colour in ((70.0, RED), (180.0, ORANGE)):
+            path = f"limits/{level:.0f}"
+            self.limit(path, trace, level)
+            self.style(path, self.rr.SeriesLines(names=f"limit {level:.0f}", colors=[colour], widths=[1.0]))
+        long = _end_s(trace) >= LONG_RUN
+        self.line("glucose/true", trace, trace.get("TruthGlucose"), "true", GREY, 1.5 if long else 2.5)
         self.line("glucose/interstitial", trace, trace.get("TruthInterstitial"), "interstitial", PURPLE, 0.8)
-        dot = 2.0 if end_s < LONG_RUN else 0.8  # else they hide the line
+        dot = 0.8 if long else 2.0  # else they hide the line
         self.points("glucose/cgm", trace.time_s, trace.get("GlucoseConc"), "CGM", BLUE, size=dot)
         meals = np.array([meal.time_s for meal in trace.meals])
         self.points("glucose/meal", meals, np.full(len(meals), 48.0), "meal (see log)", GREEN, "up", 5.0)
 
     def drugs(self, trace: Trace) -> None:
+        """Commanded against delivered, and what is in the body."""
         for name, drug, colour, unit in (("insulin", "Insulin", BLUE, "U"), ("pramlintide", "Pram", TEAL, "ug")):
             commanded, delivered = trace.get(f"{drug}RateCommanded"), trace.basal_delivered(drug)
             self.line(f"{name}/delivered", trace, delivered, f"delivered [{unit}/h]", ORANGE, 3.5, step=True)
@@ -193,23 +248,23 @@ class _Run(Logger):
         self.line("body/insulin_on_board", trace, trace.get("InsulinOnBoard"), "IOB, firmware [U]", PURPLE)
 
     def stomach(self, trace: Trace) -> None:
+        """Emptying, content, and what appears in the blood."""
         self.line("stomach/eta", trace, trace.get("TruthEta") * 100, "emptying η [%]", PINK)
         self.line("stomach/content", trace, trace.get("TruthQsto") / 1000, "content [g]", GREEN)
         self.line("stomach/appearance", trace, trace.get("TruthRa"), "Ra [mg/kg/min]", ORANGE)
 
-    def lanes(self, trace: Trace, end_s: float) -> None:
-        lanes = [lane for lane in LANES if lane[0] in trace.columns]
-        for signal, what in (("InsulinOcclusion", "insulin_line"), ("PramOcclusion", "pramlintide_line")):
-            if np.nan_to_num(trace.get(signal)).any():
-                lanes.append((signal, "PUMP_Status", what))
-        for order, (signal, message, what) in enumerate(lanes):
-            changes = state_changes(trace, signal, message)
-            self.states(f"state/{order + 1}_{what}", changes, STATE_COLOURS.get(signal, {}))
+    def lanes(self, trace: Trace) -> None:
+        """States of the nodes, alarms, faults."""
+        for order, (signal, message, what) in enumerate((*LANES, *LINE_LANES), start=1):
+            if (signal, message, what) in LANES or np.nan_to_num(trace.get(signal)).any():
+                changes = state_changes(trace, signal, message)
+                self.states(f"state/{order}_{what}", changes, STATE_COLOURS.get(signal, {}))
         self.alarms(trace)
         spans: dict[str, list[tuple[float, str]]] = {}
         for span in trace.fault_spans():
             kind = span.label.split(" ", 1)[0]
-            spans.setdefault(span.label, []).extend([(span.start_s, kind), (span.end_s, "")])
+            ending = [(span.end_s, "")] if self.is_over(span, trace) else []
+            spans.setdefault(span.label, []).extend([(span.start_s, kind), *ending])
         for label, changes in spans.items():
             self.states(f"fault/{label.replace(' ', '_')}", changes, {label.split(" ", 1)[0]: RED})
 
@@ -233,7 +288,8 @@ class _Run(Logger):
             self.states(lane, changes, tints.get(lane, {}))
 
     def log(self, trace: Trace) -> None:
-        lines = notes(trace)
+        """What happened, as text."""
+        lines = self.fresh_notes(trace)
         if lines:
             self.send(
                 "log",
@@ -246,6 +302,7 @@ class _Run(Logger):
             )
 
     def bus(self, trace: Trace, frames: Frames) -> None:
+        """How much there was on the wire, which messages, what was damaged or missed."""
         names = {0: "device", 1: "plant"}
         for channel in sorted(set(frames.channel.tolist())):
             of = names.get(channel, str(channel))
@@ -259,7 +316,6 @@ class _Run(Logger):
             if refused.any():
                 self.line(f"bus/errors/refused_{channel}", trace, refused, f"damaged frames, {of}", RED, step=True)
             self.rates(channel, trace, heard)
-            self.table(f"can/can{channel}", heard)
         for signal, what, colour in (
             ("LostFrameCount", "lost", ORANGE),
             ("E2eErrorCount", "checksum errors", RED),
@@ -277,13 +333,20 @@ class _Run(Logger):
             counts = per_step(trace, frames.step[frames.can_id == message.can_id])
             if not counts.any():
                 continue
-            usual = np.median(counts)
+            usual = self.usual(f"{channel}/{message.name}", counts)
+            if usual is None:
+                continue
             starts = np.flatnonzero(np.append(True, counts[1:] != counts[:-1]))
             changes = [(float(trace.time_s[row]), f"{counts[row]:.0f}" if counts[row] else "") for row in starts]
             colours = {
                 f"{count:.0f}": BLUE if not usual else GREEN if count == usual else ORANGE for count in set(counts)
             }
             self.states(f"rate/can{channel}/{1 if usual else 2}_{message.name}", changes, colours)
+
+    def tables(self, frames: Frames) -> None:
+        """The raw frames of each bus."""
+        for channel in sorted(set(frames.channel.tolist())):
+            self.table(f"can/can{channel}", frames.select(np.flatnonzero(frames.channel == channel)))
 
     def table(self, path: str, frames: Frames) -> None:
         """Every frame of a bus as a row: id, name and bytes, and a line of text with the decoded values."""
@@ -308,6 +371,10 @@ class _Run(Logger):
                 *self.rr.AnyValues.columns(id=texts, data=payloads, step=frames.step.astype("i8")),
             ],
         )
+
+
+def _end_s(trace: Trace) -> float:
+    return max(float(trace.time_s[-1]), STEP_SECONDS) if len(trace) else float(STEP_SECONDS)
 
 
 def per_step(trace: Trace, step: Array, weight: Array | None = None) -> Array:

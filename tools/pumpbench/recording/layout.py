@@ -39,13 +39,13 @@ class Blueprint(rrb.Blueprint):  # type: ignore[misc]
 
     _GLOBAL_VIEW = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 
-    def __init__(self, *parts: Any, window: Window, **options: Any) -> None:
+    def __init__(self, *parts: Any, window: Any, **options: Any) -> None:
         super().__init__(*parts, **options)
         self._window = window
 
     def _log_to_stream(self, stream: Any) -> None:
         super()._log_to_stream(stream)
-        stream.log(self._GLOBAL_VIEW, rrb.TimeAxis(view_range=_range(self._window)))
+        stream.log(self._GLOBAL_VIEW, rrb.TimeAxis(view_range=self._window))
 
 
 def blueprint(scene: Scene, layout: str = "day", window: Window | None = None, view: str | None = None) -> Blueprint:
@@ -70,6 +70,16 @@ def blueprint(scene: Scene, layout: str = "day", window: Window | None = None, v
     chosen = names.index(layout)
     root = rrb.Tabs(*tabs, active_tab=chosen) if view is None else _view(tabs[chosen], view)
     return linked(root, window or (scene.start_s, scene.end_s))
+
+
+def live_blueprint(scene: Scene, shown_s: float) -> Blueprint:
+    """The looks of a recording that grows: its last simulated seconds, as far as the viewer follows.
+
+    Args:
+        scene: what is known of the run.
+        shown_s: how many.
+    """
+    return linked(rrb.Tabs(day(scene), bus(scene), patient(scene)), (-shown_s, 0.0), live=True)
 
 
 def _view(tab: Any, name: str) -> Any:
@@ -214,17 +224,17 @@ def log(name: str, origin: str) -> Any:
     return rrb.TextLogView(name=name, origin=f"/{origin}", columns=columns)
 
 
-def linked(root: Any, window: Window) -> Blueprint:
-    """A blueprint whose linked time axes begin with a window."""
+def linked(root: Any, window: Window, *, live: bool = False) -> Blueprint:
+    """A blueprint whose linked time axes begin with a window; if `live`, one that goes along with the newest data."""
     return Blueprint(
         root,
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else "paused"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.TopPanel(state="hidden"),
         auto_views=False,
         auto_layout=False,
-        window=window,
+        window=_range(window, relative=live),
     )
 
 
@@ -234,9 +244,11 @@ def _axis(window: Window | None) -> Any:
     return rrb.TimeAxis(link=rrb.components.LinkAxis.Independent, view_range=_range(window))
 
 
-def _range(window: Window) -> Any:
+def _range(window: Window, *, relative: bool = False) -> Any:
+    """The range of an axis; if `relative`, to the time cursor."""
     start_s, end_s = window
     span = end_s - start_s
     nanos: Sequence[int] = [round(time_s * 1e9) for time_s in (start_s - LEGEND_SHARE * span, end_s + 0.01 * span)]
-    start, end = (rr.TimeRangeBoundary.absolute(nanos=each) for each in nanos)
+    boundary = rr.TimeRangeBoundary.cursor_relative if relative else rr.TimeRangeBoundary.absolute
+    start, end = (boundary(nanos=each) for each in nanos)
     return rr.TimeRange(start=start, end=end)
