@@ -108,12 +108,16 @@ def run(
     origin: Annotated[str | None, typer.Option("--from", metavar="RUN@TIME", help=FROM)] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder to write (default: below runs/).")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing run folder at --out.")] = False,
+    serve: Annotated[
+        int | None, typer.Option(help="Port at which Rerun's viewer shows the run while it is on.")
+    ] = None,
+    web: Annotated[int | None, typer.Option(help="And in a browser: port of the page, with --serve.")] = None,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware's first answer.")] = 20.0,
     step_timeout: Annotated[float, typer.Option(help="Seconds to wait for the firmware in a step.")] = 10.0,
 ) -> None:
     """Run the closed loop: patient, firmware and recorder on one bus. Exit status 1 if a hazard was counted."""
     from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
-    from pumpbench import rig  # noqa: PLC0415
+    from pumpbench import live, rig  # noqa: PLC0415
 
     if origin is not None:
         requests = [
@@ -155,6 +159,8 @@ def run(
             variability=varying,
             controller=controller,
             overwrite=overwrite or out is None,
+            serve=serve,
+            web=web,
             connect_timeout=connect_timeout,
             step_timeout=step_timeout,
         )
@@ -167,6 +173,8 @@ def _run(requests: list[Any]) -> None:
     from pumpbench import rig  # noqa: PLC0415
 
     prepared = [rig.prepare(request) for request in requests]
+    for line in live.where(serve, web):
+        errors.print(line, markup=False)
     folders = _execute(prepared)
     hazards = _print_outcomes(folders)
     if hazards:

@@ -1,8 +1,9 @@
 """The recorder: a passive node that turns what it hears on the bus into a run folder.
 
 It listens to the device's bus, and to the plant's as well when a gateway lies between, from before the roll call until
-the plant has closed the run. It never sends and nobody waits for it. Only at the end does it analyse and import what
-draws.
+the plant has closed the run. It never sends and nobody waits for it. What it hears goes to the disk at once
+(`pumpbench.journal`); only at the end does it analyse and import what draws. Who wants to watch gets another process
+(`pumpbench.live`).
 """
 
 import argparse
@@ -10,29 +11,29 @@ import contextlib
 import json
 import select
 import signal
+import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import can
 
 from can_bus import codec
-from can_bus.link import BusLost, Link
+from can_bus.link import Link
 from can_bus.lockstep import Phase
 from can_bus.url import BusUrlError, open_link
+from pumpbench import live
 from pumpbench.capture import Capture, read_candump
-from pumpbench.identity import stated
+from pumpbench.identity import stated, versions
+from pumpbench.journal import NAMES
+from pumpbench.repair import repair
 from pumpbench.rewind import Diverged, Origin, join
-from pumpbench.runfolder import RunFolder
+from pumpbench.runfolder import NotWritten, RunFolder, RunFolderError
 
 COALESCE_SECONDS = 0.005
 """On a hub nothing is lost while we sleep, and one wake-up then fetches many frames."""
-
-
-class _Stop(Exception):
-    """The recorder was asked to end."""
 
 
 class Ending:
@@ -59,29 +60,44 @@ class Ending:
                 self.over = True
 
 
-def listen(links: Sequence[Link], capture: Capture, *, free_running: bool = False) -> bool:
-    """Collect frames until the run is over on every bus; False if asked to stop before (SIGTERM, SIGINT).
+def listen(
+    links: Sequence[Link], capture: Capture, watch: Mapping[int, Callable[[], bool]], *, free_running: bool = False
+) -> bool:
+    """Collect frames until the run is over on every bus; False if told to end before.
+
+    Args:
+        links: the buses, the device's first.
+        capture: gets the frames.
+        watch: other descriptors, and what to do once one of them becomes readable; True ends the recording.
+        free_running: the device answers no token.
 
     Raises:
         BusLost: a bus is gone or frames were lost.
+        NotWritten: a frame could not be kept.
     """
     endings = [Ending(free_running=free_running) for _ in links]
-    by_descriptor = {link.fileno(): channel for channel, link in enumerate(links)}
+    buses = {link.fileno(): channel for channel, link in enumerate(links)}
+    others = dict(watch)
     lossless = all(link.url.startswith(("unix:", "tcp:", "inproc:")) for link in links)
-    try:
-        while by_descriptor:
-            ready, _, _ = select.select(list(by_descriptor), [], [])
-            for descriptor in ready:
-                channel = by_descriptor[descriptor]
-                frames = links[channel].recv(0)
-                capture.extend(channel, frames)
-                endings[channel].watch(frames)
-                if endings[channel].over:  # this bus may be closed now while the other one still talks
-                    del by_descriptor[descriptor]
-            if lossless:
-                time.sleep(COALESCE_SECONDS)
-    except _Stop:
-        return False
+
+    def collect(channel: int) -> None:
+        frames = links[channel].recv(0)
+        capture.extend(channel, frames)
+        endings[channel].watch(frames)
+
+    while buses:
+        ready, _, _ = select.select([*buses, *others], [], [])
+        told = [others.pop(descriptor)() for descriptor in ready if descriptor in others]
+        stop = any(told)
+        for descriptor, channel in list(buses.items()):
+            if descriptor in ready or stop:
+                collect(channel)
+            if endings[channel].over:  # this bus may be closed now while the other one still talks
+                del buses[descriptor]
+        if stop:
+            return not buses
+        if lossless:
+            time.sleep(COALESCE_SECONDS)
     return True
 
 
@@ -112,52 +128,146 @@ def write(
     folder.write_all(frames, info, measure(trace, frames), trace)
 
 
-def _stop(_number: int, _frame: object) -> None:
-    raise _Stop
+@contextlib.contextmanager
+def _signals() -> Iterator[int]:
+    """A descriptor that becomes readable on SIGTERM or SIGINT, which interrupt nothing meanwhile."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    with reader, writer:
+        before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        handlers = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            yield reader.fileno()
+        finally:
+            signal.set_wakeup_fd(before)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; exit status 0 recorded to the end, 2 wrong usage, 3 the bus or the disk failed."""
+    """Command line; exit status 0 recorded to the end or asked to end, 2 wrong usage, 3 the bus or the disk failed."""
     parser = argparse.ArgumentParser(prog="pumpbench record", description=__doc__)
-    parser.add_argument("--bus", required=True, metavar="URL", help="the device's bus")
+    parser.add_argument("--bus", metavar="URL", help="the device's bus")
     parser.add_argument("--plant-bus", metavar="URL", help="the plant's bus, when a gateway lies between")
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="the run folder to write")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="the run folder to write")
     parser.add_argument("--info", type=Path, metavar="FILE", help="JSON to be merged into run.json")
     parser.add_argument("--origin", type=Path, metavar="LOG", help="a recorded run that this one begins with")
     parser.add_argument("--origin-step", type=int, default=0, metavar="K", help="the instant up to which it does")
     parser.add_argument("--firmware-since", type=int, metavar="K", help="the instant from which this firmware answers")
     parser.add_argument("--free-running", action="store_true", help="the device answers no token")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing run folder")
+    parser.add_argument(
+        "--serve",
+        type=int,
+        nargs="?",
+        const=live.PORT,
+        metavar="PORT",
+        help=f"show the run in Rerun's viewer while it is on, on {live.ADDRESS} (default port: {live.PORT})",
+    )
+    parser.add_argument(
+        "--web",
+        type=int,
+        nargs="?",
+        const=live.WEB_PORT,
+        metavar="PORT",
+        help=f"and in a browser, with --serve (default port: {live.WEB_PORT})",
+    )
+    parser.add_argument(
+        "--repair", type=Path, metavar="DIR.partial", help="write the files that a killed recorder could not, and end"
+    )
     options = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, _stop)
-    signal.signal(signal.SIGINT, _stop)
-    capture = Capture()
+    if options.repair is not None:
+        return _repair(options.repair)
+    if options.bus is None or options.out is None:
+        parser.error("give --bus and --out (or --repair)")
+    if options.web is not None and options.serve is None:
+        parser.error("--web is a way to look at what --serve serves: give both")
+    return _record(options)
+
+
+def _record(options: argparse.Namespace) -> int:
+    urls = [options.bus, *([options.plant_bus] if options.plant_bus else [])]
     with contextlib.ExitStack() as stack:
+        stop = stack.enter_context(_signals())
         try:
-            info = json.loads(options.info.read_text(encoding="utf-8")) if options.info else {}
-            origin = None
-            if options.origin is not None:
-                origin = Origin(read_candump(options.origin), options.origin_step, options.firmware_since)
+            info, origin = _info(options), _origin(options)
+            live.check_ports(options.serve, options.web)
             folder = RunFolder.create(options.out, overwrite=options.overwrite)
-            urls = [options.bus, *([options.plant_bus] if options.plant_bus else [])]
-            links = [stack.enter_context(open_link(url)) for url in urls]
-        except (BusUrlError, OSError, can.CanError, ValueError) as error:
+        except (OSError, ValueError) as error:
             return _failed(error, 2)
-        print("ready", flush=True)
         try:
-            complete = listen(links, capture, free_running=options.free_running)
-        except (BusLost, can.CanError, OSError) as error:
-            write(folder, capture, info, complete=False)
+            journal = stack.enter_context(contextlib.closing(folder.begin(info, len(urls))))
+            view = None
+            if options.serve is not None:
+                view = live.View(folder.partial, len(urls), options.serve, options.web)
+                stack.callback(view.close)
+        except OSError as error:
             return _failed(error, 3)
         try:
+            links = [stack.enter_context(open_link(url)) for url in urls]
+        except (BusUrlError, OSError, can.CanError) as error:
+            folder.discard()
+            return _failed(error, 2)
+        print("ready", *live.where(options.serve, options.web), sep="\n", flush=True)
+
+        def keep(channel: int, records: bytes) -> None:
+            try:
+                journal.keep(channel, records)
+            except OSError as error:
+                raise folder.failed(NAMES[channel], error) from error
+
+        status = 0
+
+        def without_view() -> bool:
+            nonlocal status, view
+            assert view is not None
+            status = _failed(f"{view.ended()}; the record goes on without it", 3)
+            view = None
+            return False
+
+        watch: dict[int, Callable[[], bool]] = {stop: lambda: True}
+        if view is not None:
+            watch[view.fileno()] = without_view
+        capture, complete = Capture(keep), False
+        try:
+            complete = listen(links, capture, watch, free_running=options.free_running)
+        except NotWritten as error:
+            return _failed(error, 3)
+        except (can.CanError, OSError) as error:
+            status = _failed(error, 3)
+        try:
+            if view is not None:
+                view.finish()  # it draws the rest while we write
             write(folder, capture, info, complete=complete, origin=origin)
+            if view is not None:
+                view.wait()
         except (OSError, ValueError, Diverged) as error:
-            return _failed(error, 3)
+            status = _failed(error, 3)
+    return status
+
+
+def _info(options: argparse.Namespace) -> dict[str, Any]:
+    """What run.json says of a run that we know nothing of, and what somebody else says of it."""
+    known = versions() | {"bus": options.bus}
+    return known | (json.loads(options.info.read_text(encoding="utf-8")) if options.info else {})
+
+
+def _origin(options: argparse.Namespace) -> Origin | None:
+    if options.origin is None:
+        return None
+    return Origin(read_candump(options.origin), options.origin_step, options.firmware_since)
+
+
+def _repair(partial: Path) -> int:
+    try:
+        print(repair(partial))
+    except RunFolderError as error:
+        return _failed(error, 3 if isinstance(error, NotWritten) else 2)
     return 0
 
 
-def _failed(error: Exception, status: int) -> int:
-    print(f"recorder: {error}", file=sys.stderr)
+def _failed(reason: Exception | str, status: int) -> int:
+    print(f"recorder: {reason}", file=sys.stderr)
     return status
 
 

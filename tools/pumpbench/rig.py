@@ -42,6 +42,7 @@ from plant_server.sensors.ideal import Ideal
 from plant_server.serve import serve
 from plant_server.server import PlantServer, Run
 from plant_server.user import Plan
+from pumpbench import live
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
 from pumpbench.capture import Capture, write_candump
 from pumpbench.controller_model import ControllerModel, ControllerModelError, read_models, shipped_models
@@ -55,6 +56,9 @@ from pumpbench.runfolder import RunFolder
 
 READY_SECONDS = 30.0
 END_SECONDS = 5.0
+PARTIAL_SECONDS = 60.0
+"""What the recorder of a run that broke off may take to write what there is."""
+
 
 SERIAL = "slcan:"
 """Buses that one program opens."""
@@ -106,6 +110,8 @@ class Request:
     origin: Origin | None = None  # a recorded run that it begins with
     changes: tuple[Change, ...] = ()  # of strategy and scenario on the way
     overwrite: bool = False
+    serve: int | None = None  # port of the live view
+    web: int | None = None  # and of its page for browsers
     connect_timeout: float = 20.0
     step_timeout: float = 10.0
     progress: Callable[[int], None] = field(default=lambda step: None, compare=False)
@@ -166,6 +172,7 @@ def prepare(request: Request) -> Prepared:
         tuning = request.tuning or tuning_for(request.strategy, noisy=not isinstance(sensor.model, Ideal))
         calibration = calibrate(patient, tuning, model)
     _check_speed(request)
+    _check_view(request)
     _check_switch(request, [fault for fault in faults.wire if isinstance(fault, NodeFault)])
     mode = MODES[request.strategy]
     injected = faults.pump + faults.sensor
@@ -275,6 +282,22 @@ def _check_speed(request: Request) -> None:
         raise RigError("--speed is simulated seconds in a second, above 0")
     if request.free_running and request.bus == "inproc":
         raise RigError("--bus inproc is lockstep; a free run needs a bus")
+
+
+def _check_view(request: Request) -> None:
+    """Whether the run can be watched.
+
+    Raises:
+        RigError: it cannot, or a port is taken.
+    """
+    if request.web is not None and request.serve is None:
+        raise RigError("--web is a way to look at what --serve serves: give both")
+    if request.serve is not None and request.bus == "inproc":
+        raise RigError("--bus inproc has nobody to watch it; --serve needs a bus, e.g. --bus hub")
+    try:
+        live.check_ports(request.serve, request.web)
+    except live.LiveError as error:
+        raise RigError(str(error)) from None
 
 
 def _check_switch(request: Request, faults: Sequence[NodeFault]) -> None:
@@ -481,8 +504,10 @@ class Child:
         log: IO[bytes],
         ready: bool,
         keep: Sequence[int] = (),
+        patience: float = 2.0,
     ) -> None:
         self.name = name
+        self._patience = patience
         self._log = log
         try:
             self.process = subprocess.Popen(
@@ -541,7 +566,7 @@ class Child:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, number)
                 os.killpg(self.process.pid, signal.SIGCONT)  # one that a fault has stopped would not end
-            if self.finish(2.0) is not None and number == signal.SIGTERM:
+            if self.finish(self._patience) is not None and number == signal.SIGTERM:
                 # the leader has gone; whoever it started is in its session
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(self.process.pid, signal.SIGKILL)
@@ -557,7 +582,7 @@ class Child:
 
 
 @contextlib.contextmanager
-def _one_cpu() -> Iterator[frozenset[int]]:
+def one_cpu() -> Iterator[frozenset[int]]:
     """Keep this process, and what it starts, on one CPU; yields the others, for those who need not wait their turn.
 
     In lockstep only one side runs at a time. Handing the turn over within a CPU takes a fifth of the time that waking
@@ -642,7 +667,7 @@ def _processes(prepared: Prepared) -> Path:
     request = prepared.request
     with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory, contextlib.ExitStack() as stack:
         place = Path(directory)
-        other_cpus = stack.enter_context(_one_cpu())
+        other_cpus = stack.enter_context(one_cpu())
         children = stack.enter_context(_children())
         buses = _Buses.of(request, place, faulty=bool(prepared.faults.wire))
         hub: Hub | None = None
@@ -657,7 +682,8 @@ def _processes(prepared: Prepared) -> Path:
         def start(name: str, command: list[str], *, ready: bool, keep: Sequence[int] = ()) -> Child:
             log = stack.enter_context((place / f"{name}.log").open("ab"))
             environment = os.environ | {"PUMPBENCH_BUS": buses.device, "PYTHONUNBUFFERED": "1"}
-            child = Child(name, command, environment, log, ready, keep)
+            patience = PARTIAL_SECONDS if name == "recorder" else 2.0
+            child = Child(name, command, environment, log, ready, keep, patience)
             children.append(child)
             if name == "recorder" and other_cpus:
                 os.sched_setaffinity(child.process.pid, other_cpus)
@@ -767,6 +793,8 @@ def _start_recorder_side(
         write_candump(origin.frames, log)
         command += ["--origin", str(log), "--origin-step", str(origin.step)]
         command += ["--firmware-since", str(origin.since)] if origin.since is not None else []
+    command += ["--serve", str(prepared.request.serve)] if prepared.request.serve is not None else []
+    command += ["--web", str(prepared.request.web)] if prepared.request.web is not None else []
     return start("recorder", command, ready=True)
 
 

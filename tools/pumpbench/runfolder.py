@@ -8,6 +8,8 @@
     summary.png       the same as one picture
 
 A folder is written under the name `<out>.partial` and renamed at the end: a folder without `.partial` is complete.
+While the run is on it holds run.json, a journal of the frames (`pumpbench.journal`) and, of a run that is watched, a
+recording that grows; `pumpbench.repair` makes the rest of them.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import dbc
+from pumpbench import journal
 from pumpbench.capture import Frames, read_candump, write_candump
 from pumpbench.trace import PARQUET_NAME, Trace
 
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 RUN, LOG, METRICS, RECORDING, SUMMARY = "run.json", "bus.log", "metrics.json", "recording.rrd", "summary.png"
 FILES: Final = (RUN, LOG, PARQUET_NAME, METRICS, RECORDING, SUMMARY)
 PARTIAL: Final = ".partial"
+_SCRATCH: Final = ".recording-"
 
 
 class RunFolderError(OSError):
@@ -91,6 +95,18 @@ class RunFolder:
             raise RunFolderError(f"cannot make {folder.partial}: {error.strerror}") from None
         return folder
 
+    def begin(self, info: Mapping[str, Any], channels: int) -> journal.Journal:
+        """Write what is known before the first frame, and open the journal.
+
+        Raises:
+            NotWritten: a file could not be written.
+        """
+        self._write(RUN, lambda path: _dump({**info, "complete": False}, path))
+        try:
+            return journal.Journal(self.partial, channels)
+        except OSError as error:
+            raise self.failed("the journal", error) from error
+
     def write_all(
         self, frames: Frames, info: Mapping[str, Any], metrics: Mapping[str, Any], trace: Trace | None = None
     ) -> None:
@@ -117,6 +133,7 @@ class RunFolder:
         self._write(METRICS, lambda path: _dump(metrics, path))
         self._write(RECORDING, lambda path: write_recording(trace, frames, path, metrics))
         self._write(SUMMARY, lambda path: write_summary(trace, path, metrics))
+        self._remove_journal()
         self._rename()
 
     def write_partial(self, frames: Frames, info: Mapping[str, Any]) -> None:
@@ -125,10 +142,15 @@ class RunFolder:
         Raises:
             NotWritten: a file could not be written.
         """
+        from pumpbench.recording.file import write_recording  # noqa: PLC0415
+
         info = self._info(frames, info, complete=False)
+        trace = Trace.from_frames(frames, info)
         self._write(RUN, lambda path: _dump(info, path))
         self._write(LOG, lambda path: write_candump(frames, path))
-        self._write(PARQUET_NAME, Trace.from_frames(frames, info).save)
+        self._write(PARQUET_NAME, trace.save)
+        self._write(RECORDING, lambda path: write_recording(trace, frames, path))
+        self._remove_journal()
 
     def discard(self) -> None:
         """Remove the unfinished folder, e.g. of a run that never began."""
@@ -143,13 +165,20 @@ class RunFolder:
         try:
             write(path)
         except (OSError, RuntimeError) as error:
-            free = shutil.disk_usage(self.partial).free if self.partial.exists() else 0
-            full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error)
-            full = full or free < 1_000_000
-            reason = (
-                f"the disk is full ({free // 1024} KiB free)" if full else getattr(error, "strerror", "") or str(error)
-            )
-            raise NotWritten(f"cannot write {name}: {reason}; what there is of the run is in {self.partial}") from error
+            raise self.failed(name, error) from error
+
+    def failed(self, name: str, error: Exception) -> NotWritten:
+        """What to say of a file of this folder that could not be written."""
+        free = shutil.disk_usage(self.partial).free if self.partial.exists() else 0
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error)
+        full = full or free < 1_000_000
+        reason = f"the disk is full ({free // 1024} KiB free)" if full else getattr(error, "strerror", "") or str(error)
+        return NotWritten(f"cannot write {name}: {reason}; what there is of the run is in {self.partial}")
+
+    def _remove_journal(self) -> None:
+        """The log holds all of it."""
+        for name in journal.NAMES:
+            (self.partial / name).unlink(missing_ok=True)
 
     def _rename(self) -> None:
         old = None
@@ -250,7 +279,10 @@ class RunFolder:
 
 
 def _dump(content: Mapping[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    """Write JSON; on a full disk an older file stays as it is."""
+    new = path.with_name(f"{_SCRATCH}{path.name}")
+    new.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    new.replace(path)
 
 
 def plain(value: Any) -> Any:
@@ -268,9 +300,9 @@ def plain(value: Any) -> Any:
 
 def _is_run_folder(path: Path, *, unfinished: bool = False) -> bool:
     names = _names(path.iterdir())
-    return names <= set(FILES) if unfinished else RUN in names
+    return names <= {*FILES, *journal.NAMES} if unfinished else RUN in names
 
 
 def _names(entries: Iterable[Path]) -> set[str]:
-    """Names of the entries, without the scratch folders a killed recorder may leave."""
-    return {entry.name for entry in entries if not entry.name.startswith(".recording-")}
+    """Names of the entries, without the scratch files and folders a killed recorder may leave."""
+    return {entry.name for entry in entries if not entry.name.startswith(_SCRATCH)}
