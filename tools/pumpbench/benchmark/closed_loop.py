@@ -26,7 +26,7 @@ from can_bus.lockstep import STEPS_PER_DAY
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from pumpbench import rig
-from pumpbench.benchmark import parts, simglucose_peer
+from pumpbench.benchmark import beside, parts, simglucose_peer
 from pumpbench.benchmark.round_trips import CEILING_OF, Figure, figure, measure, round_trips, vcan_available
 from pumpbench.calibration import MODES
 from pumpbench.closed_loop import Case, simulate
@@ -166,6 +166,7 @@ def all_figures(*, quick: bool, only_vcan: bool = False, peers: bool = True) -> 
     figures = plant_alone(days=10 if quick else 100, runs=runs)
     figures += closed_loop("compiled", days=2 if quick else 14, runs=runs)
     figures += parts.figures(quick=quick)
+    figures += beside.figures(days=days, runs=runs)
     if peers:
         figures += simglucose_peer.compare(runs=1 if quick else 3, days=10 if quick else 100)
     figures += round_trips(["hub"], steps=steps, runs=runs)

@@ -27,6 +27,7 @@ means more than the value.
 | `codec/pack`, `unpack` | one frame, raw integers | cantools without scaling |
 | `codec/protected` | packing, counter and checksum | the checksum alone, in C |
 | `recorder/listening` | a run with the recorder | the same run without |
+| `recorder/beside`, `watched` | a run on a hub, the recorder a process, and watched | the same run without |
 | `recorder/writing` | the run folder, recording and picture included | the run itself |
 | `start/...` | starts of a process | a bare Python |
 | `memory/campaign` | resident memory after ten adults in seven modes, 14 days | what a study may take |
