@@ -1,6 +1,6 @@
 """The benchmark's parts run and are what they are called, and the page is made of the figures."""
 
-from pumpbench.benchmark import page, parts
+from pumpbench.benchmark import beside, page, parts
 from pumpbench.benchmark.round_trips import Figure
 
 
@@ -14,6 +14,12 @@ def test_every_part_gives_a_figure_with_its_ceiling() -> None:
     for each in found:
         assert set(each) == {"name", "value", "unit", "ceiling", "ratio", "runs"}
         assert each["value"] > 0 and each["ceiling"] > 0 and each["ratio"] > 0, each["name"]
+
+
+def test_a_recorder_beside_the_loop() -> None:
+    found = beside.figures(days=1, runs=1)
+    assert [each["name"] for each in found] == ["recorder/beside", "recorder/watched"]
+    assert all(each["value"] > 0 and each["ceiling"] > 0 for each in found)
 
 
 def test_the_page_has_every_figure_and_the_machine() -> None:

@@ -195,7 +195,8 @@ def test_the_benchmark_asks_only_when_wanted(monkeypatch: pytest.MonkeyPatch) ->
     for name in ("plant_alone", "round_trips", "_in_guest"):
         monkeypatch.setattr(closed_loop, name, lambda *_, **__: [])
     monkeypatch.setattr(closed_loop, "closed_loop", lambda *_, **__: [])
-    monkeypatch.setattr(closed_loop.parts, "figures", lambda **_: [])
+    for module in (closed_loop.parts, closed_loop.beside):
+        monkeypatch.setattr(module, "figures", lambda **_: [])
     monkeypatch.setattr(closed_loop, "vcan_available", lambda: False)
     monkeypatch.setattr(peer, "compare", lambda **options: asked.append(options) or ["peer"])
     assert "peer" not in closed_loop.all_figures(quick=True, peers=False)
