@@ -48,7 +48,8 @@ def same(one: Frames, other: Frames) -> bool:
 
 @pytest.fixture(scope="module")
 def gateway() -> Sent:
-    return Loop(60, occlusion=range(40, 44), faults=dropping("CGM_Reading", range(24, 36))).run_frames()
+    """With an announced meal in step 96, whose bolus takes further turns."""
+    return Loop(100, occlusion=range(40, 44), faults=dropping("CGM_Reading", range(24, 36))).run_frames()
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -75,7 +76,7 @@ def test_a_step_is_handed_out_when_the_device_has_closed_it(gateway: Sent) -> No
             assert closes
             assert frames.frame(len(frames) - 1) == frame
             steps += sorted(set(frames.step.tolist()))
-    assert steps == list(range(61))
+    assert steps == list(range(101))
 
 
 def test_a_device_that_answers_no_token_is_one_step_behind() -> None:

@@ -38,14 +38,16 @@ def read(path: Path) -> Rows:
     return found
 
 
-def drawn(sent: list[tuple[int, Frame]], folder: Path, seed: int) -> tuple[Rows, Rows]:
+def drawn(
+    sent: list[tuple[int, Frame]], folder: Path, seed: int, lengths: tuple[int, ...] = (20, 60, 200, 1500)
+) -> tuple[Rows, Rows]:
     """The same frames drawn as they come, in batches of many lengths, and all at once."""
     channels = 1 + max(channel for channel, _ in sent)
     recording = LiveRecording(folder / "live.rrd", free_port(), {"patient": "adult#001"}, gateway=channels > 1)
     follower, capture, rng = Follower(channels), Capture(), random.Random(seed)
     position = 0
     while position < len(sent):
-        batch = sent[position : position + rng.choice([20, 60, 200, 1500])]
+        batch = sent[position : position + rng.choice(lengths)]
         position += len(batch)
         for channel, frame in batch:
             follower.extend(channel, pack([frame]))
@@ -83,32 +85,34 @@ def test_live_and_afterwards_the_same(seed: int, tmp_path: Path) -> None:
 
 
 def test_what_holds_longer_than_the_window(tmp_path: Path) -> None:
-    """A standing alarm is no new alarm after an hour, an open fault ends hours later, a boot ends what it ends."""
+    """A standing alarm is none anew, unless the device has started anew; an open fault ends; colours stay."""
     tx = codec.Transmitter()
-    found: list[tuple[int, Frame]] = []
-    done = codec.message("SYNC_Done").can_id
-    inject = {"FaultTarget": codec.choice("FAULT_Inject", "FaultTarget", "CGM"), "FaultCanId": 0x100, "FaultCount": 0}
+    cgm = {"FaultTarget": codec.choice("FAULT_Inject", "FaultTarget", "CGM"), "FaultCanId": 0x100, "FaultCount": 0}
+    alarm = {"CtrlAlarmState": 1, "CtrlAlarmPriority": 2, "CtrlAlarmCode": 1, "CtrlAlarmInstance": 7}
+    status = {"CtrlMode": 6, "InsulinOnBoard": 120, "LimiterBits": 0, "LastMealId": 0, "LastCgmSeq": 0}
+    extra = {
+        5: tx.frame("FAULT_Inject", FaultKind=1, **cgm),
+        10: tx.frame("CTRL_Alarm", **alarm),
+        30: tx.frame("CTRL_Status", CtrlState=codec.choice("CTRL_Status", "CtrlState", "SafeBasal"), **status),
+        50: tx.frame("CTRL_Alarm", **alarm),
+        55: tx.frame("CTRL_Status", CtrlState=codec.choice("CTRL_Status", "CtrlState", "Suspended"), **status),
+        60: tx.frame("FAULT_Inject", FaultKind=0, **cgm),
+        65: tx.frame("HB_CTRL", NmtCtrl=0, ToggleCtrl=0, ResetCauseCtrl=1, BootCtrl=2),
+        85: tx.frame("CTRL_Alarm", **alarm),
+    }
+    sent: list[tuple[int, Frame]] = []
     step = -2  # the roll call and the calibration are closed as well
-    for channel, frame in Loop(90).run_frames():
-        if frame.can_id == done and codec.message("SYNC_Done").unpack(frame.data)["DoneStatus"] == 0:
-            extra = []
-            if step == 5:
-                extra.append(tx.frame("FAULT_Inject", FaultKind=1, **inject))
-            if step in (10, 50):
-                extra.append(
-                    tx.frame("CTRL_Alarm", CtrlAlarmState=1, CtrlAlarmPriority=2, CtrlAlarmCode=1, CtrlAlarmInstance=7)
-                )
-            if step == 60:
-                extra.append(tx.frame("FAULT_Inject", FaultKind=0, **inject))
-            if step == 70:
-                extra.append(tx.frame("HB_CTRL", NmtCtrl=0, ToggleCtrl=0, ResetCauseCtrl=1, BootCtrl=2))
-            found += [(0, each) for each in extra]
+    for channel, frame in Loop(95).run_frames():
+        if frame.can_id == codec.message("SYNC_Done").can_id:
+            sent += [(0, extra[step])] if step in extra else []
             step += 1
-        found.append((channel, frame))
-    live, whole = drawn(found, tmp_path, 1)
-    for entity in ("/alarm/CgmLost_CTRL", "/fault/Drop_CGM_Reading"):
+        sent.append((channel, frame))
+    live, whole = drawn(sent, tmp_path, 1, lengths=(20, 40))
+    for entity in ("/alarm/CgmLost_CTRL", "/fault/Drop_CGM_Reading", "/state/1_firmware"):
         assert live[entity] == whole[entity], entity
-    assert len(live["/alarm/CgmLost_CTRL"]) == 3  # its looks, once raised, once ended by the boot
+    assert [time // 300 for time in live["/alarm/CgmLost_CTRL"] if time >= 0] == [10, 65, 85]
+    assert [time // 300 for time in live["/fault/Drop_CGM_Reading"] if time >= 0] == [5, 60]
+    assert {time for time in live["/log"] if live["/log"][time] != whole["/log"].get(time)} == {5 * 300.0}
 
 
 def test_nothing_to_draw(tmp_path: Path) -> None:

@@ -40,21 +40,21 @@ ELSEWHERE = {
 
 VIEWS = (
     "Glucose [mg/dL]",
-    "Insulin: commanded against delivered",
-    "Pramlintide: commanded against delivered",
-    "Stomach",
+    "Insulin: commanded against delivered [U/h, U]",
+    "Pramlintide: commanded against delivered [µg/h, µg]",
     "Alarms, injected faults, states",
-    "Alarms, faults, meals, states",
-    "Bus: frames per step, firmware's counters",
+    "What happened",
     "Frames, device's bus",
+    "Frames per step",  # in a tab of its own
 )
 
 INK = {
-    "CGM": ((0, 1000), (30, 220), (64, 156, 255)),
-    "insulin delivered": ((200, 1000), (260, 380), (255, 152, 38)),
-    "emptying": ((200, 1000), (585, 670), (236, 96, 160)),
-    "states": ((700, 1000), (740, 900), (125, 205, 130)),
-    "frames per step": ((1200, 1590), (400, 610), (88, 190, 96)),
+    "CGM": ((180, 1050), (60, 270), (64, 156, 255)),
+    "true glucose": ((180, 1050), (60, 270), (150, 150, 150)),
+    "insulin commanded": ((200, 1050), (330, 450), (64, 156, 255)),
+    "pramlintide commanded": ((200, 1050), (505, 625), (38, 178, 172)),
+    "states": ((430, 1050), (700, 840), (125, 205, 130)),
+    "what happened": ((1120, 1400), (98, 125), (88, 190, 96)),
 }
 """Where in the picture which colour has to be: columns, rows, red, green and blue."""
 
@@ -114,7 +114,7 @@ def state(page: Page) -> str:
     """What Rerun's viewer says of itself: a message of protocol buffers, whose names can be read."""
     if not page.evaluate("typeof _handle !== 'undefined'"):
         return ""
-    return bytes(page.evaluate("Array.from(_handle.viewer_state())")).decode("latin-1")
+    return bytes(page.evaluate("Array.from(_handle.viewer_state())")).decode(errors="replace")
 
 
 def test_a_browser_shows_a_run_that_is_on(browser: str, bus: Bus, runs: Path) -> None:
