@@ -1,7 +1,8 @@
 """What README and docs tell a reader to type does what they say: run here, with its output where the page shows it.
 
-A `yaml` block that begins with its name is a file, an `sh` block a script, a `console` block a dialogue whose answers must
-come as printed (`...` stands for anything). A page is one session: what a command leaves behind is there for the next one.
+A `yaml` block that begins with its name is a file, an `sh` block a script, a `console` block a dialogue whose answers
+must come as printed (`...` stands for anything). A page is one session: what a command leaves behind is there for the
+next one.
 """
 
 import os

@@ -117,7 +117,7 @@ def run(
 ) -> None:
     """Run the closed loop: patient, firmware and recorder on one bus. Exit status 1 if a hazard was counted."""
     from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
-    from pumpbench import live, rig  # noqa: PLC0415
+    from pumpbench import rig  # noqa: PLC0415
 
     if origin is not None:
         requests = [
@@ -129,6 +129,8 @@ def run(
                 reset_hook=reset_hook,
                 reset_line=reset_line,
                 overwrite=overwrite or out is None,
+                serve=serve,
+                web=web,
                 connect_timeout=connect_timeout,
                 step_timeout=step_timeout,
             )
@@ -170,10 +172,10 @@ def run(
 
 
 def _run(requests: list[Any]) -> None:
-    from pumpbench import rig  # noqa: PLC0415
+    from pumpbench import live, rig  # noqa: PLC0415
 
     prepared = [rig.prepare(request) for request in requests]
-    for line in live.where(serve, web):
+    for line in live.where(requests[0].serve, requests[0].web):
         errors.print(line, markup=False)
     folders = _execute(prepared)
     hazards = _print_outcomes(folders)
