@@ -57,6 +57,14 @@ def frames_of(rrd: Path, channel: int = 0) -> list[tuple[float, int, bytes]]:
     return sorted(rows, key=lambda row: row[0])
 
 
+def count_so_far(rrd: Path) -> int:
+    """How many frames are in a recording that still grows; none while its newest part is half written."""
+    try:
+        return len(frames_of(rrd))
+    except RuntimeError:
+        return 0
+
+
 def same_as_log(rrd: Path, log: Path) -> bool:
     """Whether a recording holds the frames of a log, each once, at its time and with its bytes."""
     logged = read_candump(log)

@@ -21,6 +21,7 @@ from live_bus import (
     RUN,
     Bus,
     children,
+    count_so_far,
     frames_of,
     free_port,
     same_as_log,
@@ -82,7 +83,7 @@ def test_a_viewer_gets_every_frame_while_the_run_is_on(bus: Bus) -> None:
         url = f"rerun+http://127.0.0.1:{port}/proxy"
         with viewer(url, bus.folder / "early.rrd", bus.folder):
             bus.say(HALF)
-            bus.until(lambda: len(frames_of(bus.folder / "early.rrd")) > 300, "what was said so far")
+            bus.until(lambda: count_so_far(bus.folder / "early.rrd") > 300, "what was said so far")
             with viewer(url, bus.folder / "late.rrd", bus.folder):
                 bus.say(RUN[len(HALF) :])
                 assert bus.end(process) == (0, "")
@@ -157,7 +158,7 @@ def test_a_new_run_on_the_bus_is_a_new_recording(bus: Bus) -> None:
         url = f"rerun+http://127.0.0.1:{port}/proxy"
         with viewer(url, bus.folder / "first.rrd", bus.folder):
             bus.say(HALF[:-7])
-            bus.until(lambda: len(frames_of(bus.folder / "first.rrd")) > 300, "the first run")
+            bus.until(lambda: count_so_far(bus.folder / "first.rrd") > 300, "the first run")
             bus.said = []
             bus.say(HALF)
             (view,) = children(process.pid)
@@ -214,6 +215,19 @@ def test_killed_it_leaves_what_it_heard(watched: bool, bus: Bus, pumpbench: Pump
     assert done.stdout == f"{bus.partial}\n"
     check_partial(bus)
     assert repair(bus.partial) == bus.partial  # again, now from the log
+    check_partial(bus)
+
+
+def test_what_a_killed_recorder_left_is_mended_by_whoever_looks_at_it(bus: Bus, pumpbench: Pumpbench) -> None:
+    with bus.recorder() as process:
+        bus.say(HALF)
+        bus.until(bus.heard, "what was said")
+        process.kill()
+        process.wait()
+    done = pumpbench("snapshot", bus.partial, "--out", bus.folder / "day.png")
+    assert done.returncode == 0, done.stderr
+    assert "its recorder did not come to its end" in done.stderr
+    assert (bus.folder / "day.png").is_file()
     check_partial(bus)
 
 

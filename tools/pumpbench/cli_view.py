@@ -117,10 +117,16 @@ def _newest() -> Path:
 
 
 def _recording(path: Path) -> Path:
-    from pumpbench.runfolder import RECORDING, RunFolder  # noqa: PLC0415
+    """The recording of what was named; what a killed recorder left is made readable first."""
+    from pumpbench.journal import NAMES  # noqa: PLC0415
+    from pumpbench.repair import repair  # noqa: PLC0415
+    from pumpbench.runfolder import PARTIAL, RECORDING, RunFolder  # noqa: PLC0415
 
     if path.is_file():
         return path
+    if path.name.endswith(PARTIAL) and any((path / name).exists() for name in NAMES):
+        repair(path)
+        errors.print(f"{path}: its recorder did not come to its end; the recording was made of what it had heard")
     if (path / RECORDING).is_file():
         return path / RECORDING
     return RunFolder.load(path).recording  # says what is missing
