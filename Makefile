@@ -31,6 +31,7 @@ nightly: setup   ## the long tests: hostile sequences, random frames, oracle and
 	PUMPBENCH_NIGHTLY=1 PUMPBENCH_SEQUENCES=10000 PUMPBENCH_RANDOM_FRAMES=1000000 PUMPBENCH_KILLS=1000 \
 	  $(BIN)/python -m pytest --timeout 5400 -n logical --dist loadfile tests/test_hostile.py tests/test_float_oracle.py \
 	  tests/test_compiled_loop.py tests/test_catalogue.py tests/test_hunt.py tests/test_kills.py tests/test_conformance_variants.py
+	PUMPBENCH_NIGHTLY=1 $(BIN)/python -m pytest --timeout 5400 -n logical --dist loadfile -m "nightly and not vcan"
 
 mutation: setup  ## mutation score of the dosing, limits, protocol and memory modules (about an hour)
 	$(BIN)/mutmut run

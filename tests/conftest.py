@@ -12,6 +12,35 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
+LONG_FILES = (
+    "test_cortex_m3.py",
+    "test_catalogue.py",
+    "test_closed_loop.py",
+    "test_rig_failures.py",
+    "test_conformance_variants.py",
+    "test_fork.py",
+    "test_live_recorder.py",
+    "test_docs.py",
+    "test_looks.py",
+    "test_study.py",
+    "test_doctor.py",
+    "test_c_firmware.py",
+    "test_conformance.py",
+    "test_evidence.py",
+)
+"""The files that take longest: they begin first, so that at the end no process works alone."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave the nightly tests to the night, and begin with the longest files."""
+    if not os.environ.get("PUMPBENCH_NIGHTLY"):
+        left_out = [item for item in items if item.get_closest_marker("nightly")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("nightly")]
+    rank = {name: number for number, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     report = yield

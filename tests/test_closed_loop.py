@@ -130,7 +130,9 @@ def test_strategies_meet_the_same_sensor_and_meals(pumpbench: Pumpbench, runs: P
     assert abs(noise[0] - noise[1]).max() < 0.12  # quantised to 0.1 and 0.02 mg/dL
 
 
-@pytest.mark.parametrize(("strategy", "low", "high"), [("nma", 82, 92), ("s2", 93, 99)])
+@pytest.mark.parametrize(
+    ("strategy", "low", "high"), [pytest.param("nma", 82, 92, marks=pytest.mark.nightly), ("s2", 93, 99)]
+)
 def test_cohort_is_where_the_prototype_was(
     strategy: str, low: float, high: float, pumpbench: Pumpbench, runs: Path
 ) -> None:

@@ -147,7 +147,11 @@ def run(pumpbench: Pumpbench, out: Path, *arguments: str | Path, status: int = 0
     return RunFolder.load(out)
 
 
-@pytest.mark.parametrize(("days", "faults"), [("1", ""), ("0.25", DROPPED)], ids=["a day", "an hour without samples"])
+@pytest.mark.parametrize(
+    ("days", "faults"),
+    [("1", ""), pytest.param("0.25", DROPPED, marks=pytest.mark.nightly)],
+    ids=["a day", "an hour without samples"],
+)
 def test_a_day_is_the_same_to_the_last_bit(
     build: Path, pumpbench: Pumpbench, runs: Path, days: str, faults: str
 ) -> None:
@@ -321,7 +325,7 @@ BABBLES = {
 """The step from which on it babbles, what, and the verdict."""
 
 
-@pytest.mark.parametrize("way", ["hub", "serial port"])
+@pytest.mark.parametrize("way", [pytest.param("hub", marks=pytest.mark.nightly), "serial port"])
 @pytest.mark.parametrize("name", BABBLES)
 def test_a_board_that_babbles_ends_with_a_verdict(
     name: str, way: str, build: Path, pumpbench: Pumpbench, runs: Path

@@ -67,9 +67,14 @@ LONG = (
     "campaign --modes nma,s2 --seeds 1-20",
     "campaign --patient all",
     "run --patient all",
+    "--days 14 --seed 1",
     "conformance --bus hub",
 )
 """Parts of commands that take minutes: run with PUMPBENCH_NIGHTLY=1."""
+
+
+EVERY_TIME = ("README.md", "docs/troubleshooting.md", "docs/extending.md")
+"""Pages that are typed in `make test`; the others in a job of their own in CI, and in `make nightly`."""
 
 
 class Block(NamedTuple):
@@ -84,6 +89,12 @@ def blocks(page: str) -> list[Block]:
         Block(text.count("\n", 0, found.start()) + 1, found[1], found[2])
         for found in re.finditer(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     ]
+
+
+def shown(pages: list[str], *languages: str) -> list[object]:
+    """The pages with such a block, as parameters."""
+    found = [page for page in pages if any(block.language in languages for block in blocks(page))]
+    return [pytest.param(page, marks=[] if page in EVERY_TIME else [pytest.mark.nightly]) for page in found]
 
 
 def lines(block: Block) -> Iterator[str]:
@@ -161,7 +172,7 @@ def bash(script: str, folder: Path, options: str = "-euo") -> "subprocess.Comple
 
 
 @pytest.mark.timeout(3600 if os.environ.get("PUMPBENCH_NIGHTLY") else 240)
-@pytest.mark.parametrize("page", [page for page in PAGES if any(b.language in ("sh", "console") for b in blocks(page))])
+@pytest.mark.parametrize("page", shown(PAGES, "sh", "console"))
 def test_a_page_is_a_session_that_works(page: str, desk: Path) -> None:
     place = desk / (Path(page).parent if page.startswith("examples/") else "")
     for block in blocks(page):
@@ -181,7 +192,7 @@ def test_a_page_is_a_session_that_works(page: str, desk: Path) -> None:
                     )
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if any(b.language == "python" for b in blocks(page))])
+@pytest.mark.parametrize("page", shown(PAGES, "python"))
 def test_python_on_a_page_runs(page: str, desk: Path) -> None:
     for number, block in enumerate(block for block in blocks(page) if block.language == "python"):
         where = f"{page}:{block.line}"
@@ -228,12 +239,12 @@ def test_options_that_are_shown_exist(page: str) -> None:
 
 def test_every_reason_is_needed() -> None:
     """Nothing stands in the table above that no page needs any more."""
-    shown = "\n".join(
+    typed = "\n".join(
         command for page in PAGES for block in blocks(page) if block.language == "sh" for command in lines(block)
     )
-    shown += "\n".join(block.text for page in PAGES for block in blocks(page) if block.language == "console")
+    typed += "\n".join(block.text for page in PAGES for block in blocks(page) if block.language == "console")
     for part in (*NOT_HERE, *ON_VCAN, *LONG):
-        assert part in shown, f"no page shows {part!r}"
+        assert part in typed, f"no page shows {part!r}"
 
 
 def test_an_output_that_differs_is_noticed() -> None:

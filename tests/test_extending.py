@@ -14,6 +14,8 @@ from conftest import ROOT
 
 EXAMPLES = ROOT / "examples" / "extending"
 AT_MOST = 40
+NO_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
+"""To compile a copy takes longer than to run it as it is; both give the same bits (tests/test_compiled_loop.py)."""
 
 
 def changed_lines(patch: Path) -> int:
@@ -38,7 +40,7 @@ class Copy:
         done = subprocess.run(
             [sys.executable, "-P", "-m", "pumpbench", *arguments],
             cwd=self.place,
-            env=os.environ | {"PYTHONPATH": f"{self.place}:{self.place / 'tools'}:{path}"},
+            env=os.environ | {"PYTHONPATH": f"{self.place}:{self.place / 'tools'}:{path}"} | NO_COMPILER,
             capture_output=True,
             text=True,
             timeout=240,

@@ -492,6 +492,7 @@ def test_sensor_lost(bench, red, minutes):
 """
 
 
+@pytest.mark.nightly
 def test_continuations_in_the_pytest_plugin(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(TEST)
     result = pytester.runpytest_subprocess(

@@ -543,50 +543,47 @@ def main() -> None:
         sys.exit(status)
 
 
+STATUS_OF = {
+    "can_bus.address.BusUrlError": EXIT_USAGE,
+    "can_bus.codec.CodecError": EXIT_USAGE,
+    "can_bus.yaml_file.FileError": EXIT_USAGE,
+    "plant_server.physiology.patients.PatientError": EXIT_USAGE,
+    "plant_server.scenario.ScenarioError": EXIT_USAGE,
+    "plant_server.sensor.SensorError": EXIT_USAGE,
+    "pumpbench.calibration.CalibrationError": EXIT_USAGE,
+    "pumpbench.campaign.CampaignError": EXIT_USAGE,
+    "pumpbench.checkpoint.CheckpointError": EXIT_USAGE,
+    "pumpbench.closed_loop.case.CaseError": EXIT_USAGE,
+    "pumpbench.comparison.record.RecordError": EXIT_USAGE,
+    "pumpbench.controller_model.ControllerModelError": EXIT_USAGE,
+    "pumpbench.convert.ConvertError": EXIT_USAGE,
+    "pumpbench.fork.ForkError": EXIT_USAGE,
+    "pumpbench.hunt.HuntError": EXIT_USAGE,
+    "pumpbench.recording.tool.RecordingError": EXIT_USAGE,
+    "pumpbench.replay.ReplayError": EXIT_USAGE,
+    "pumpbench.rig.RigError": EXIT_USAGE,
+    "pumpbench.runfolder.RunFolderError": EXIT_USAGE,
+    "plant_server.serve.MemberSilent": EXIT_DEAD,
+    "plant_server.server.PlantError": EXIT_DEAD,
+    "pumpbench.campaign.ClusterError": EXIT_DEAD,
+    "pumpbench.closed_loop.result.LoopError": EXIT_DEAD,
+    "pumpbench.rewind.Diverged": EXIT_DEAD,
+    "pumpbench.rig.NodeDied": EXIT_DEAD,
+    "pumpbench.runfolder.NotWritten": EXIT_DEAD,
+    "can.exceptions.CanError": EXIT_DEAD,
+    "builtins.OSError": EXIT_DEAD,
+}
+"""Exit status of the errors we know, by the name of the class: an import for each would cost every error line seconds."""
+
+
 def _status(error: Exception) -> int | None:
     """The exit status of an error, None for one that is our own mistake and deserves its traceback."""
     if isinstance(error, Failed):
         return error.status
     if isinstance(error, Interrupted):
         return EXIT_INTERRUPTED
-
-    import can  # noqa: PLC0415
-
-    from can_bus.codec import CodecError  # noqa: PLC0415
-    from can_bus.url import BusUrlError  # noqa: PLC0415
-    from can_bus.yaml_file import FileError  # noqa: PLC0415
-    from plant_server.physiology import PatientError  # noqa: PLC0415
-    from plant_server.scenario import ScenarioError  # noqa: PLC0415
-    from plant_server.sensor import SensorError  # noqa: PLC0415
-    from plant_server.serve import MemberSilent  # noqa: PLC0415
-    from plant_server.server import PlantError  # noqa: PLC0415
-    from pumpbench.calibration import CalibrationError  # noqa: PLC0415
-    from pumpbench.campaign import CampaignError, ClusterError  # noqa: PLC0415
-    from pumpbench.checkpoint import CheckpointError  # noqa: PLC0415
-    from pumpbench.closed_loop import CaseError, LoopError  # noqa: PLC0415
-    from pumpbench.comparison.record import RecordError  # noqa: PLC0415
-    from pumpbench.controller_model import ControllerModelError  # noqa: PLC0415
-    from pumpbench.convert import ConvertError  # noqa: PLC0415
-    from pumpbench.fork import ForkError  # noqa: PLC0415
-    from pumpbench.hunt import HuntError  # noqa: PLC0415
-    from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
-    from pumpbench.replay import ReplayError  # noqa: PLC0415
-    from pumpbench.rewind import Diverged  # noqa: PLC0415
-    from pumpbench.rig import NodeDied, RigError  # noqa: PLC0415
-    from pumpbench.runfolder import NotWritten, RunFolderError  # noqa: PLC0415
-
-    wrong = (
-        CampaignError | CaseError | BusUrlError | CodecError | FileError | PatientError | ScenarioError | SensorError
-    )
-    wrong |= CalibrationError | CheckpointError | ControllerModelError | ConvertError | ForkError | HuntError
-    wrong |= RecordError | RecordingError | ReplayError | RigError | RunFolderError
-    if isinstance(error, wrong) and not isinstance(error, NotWritten):
-        return EXIT_USAGE
-    if isinstance(
-        error, ClusterError | Diverged | LoopError | NodeDied | MemberSilent | PlantError | can.CanError | OSError
-    ):
-        return EXIT_DEAD
-    return None
+    names = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(error).__mro__)
+    return next((STATUS_OF[name] for name in names if name in STATUS_OF), None)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ class FileBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         end = None if timeout is None else time.monotonic() + timeout
         while True:
-            while record := os.pread(self._file, RECORD.size, self._offset):
+            while len(record := os.pread(self._file, RECORD.size, self._offset)) == RECORD.size:
                 self._offset += RECORD.size
                 can_id, length, data, sender = RECORD.unpack(record)
                 if sender != self._me:
