@@ -573,7 +573,7 @@ STATUS_OF = {
     "can.exceptions.CanError": EXIT_DEAD,
     "builtins.OSError": EXIT_DEAD,
 }
-"""Exit status of the errors we know, by the name of the class: an import for each would cost every error line seconds."""
+"""Exit status of the errors we know, by the class's name: an import for each would cost every error line seconds."""
 
 
 def _status(error: Exception) -> int | None:
