@@ -149,6 +149,7 @@ def test_the_list_and_a_kind_on_the_command_line(pumpbench: Pumpbench, runs: Pat
     assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1) and "did you mean drop" in wrong.stderr
 
 
+@pytest.mark.nightly
 def test_the_matrix_on_the_command_line(pumpbench: Pumpbench, runs: Path) -> None:
     done = pumpbench("matrix", "--seeds", "1", "--modes", "nma", "--markdown", runs / "page.md", "--jobs", "1")
     assert done.returncode == 0, done.stderr

@@ -83,6 +83,7 @@ def test_the_end_of_a_run_that_goes_on_later(tmp_path: Path) -> None:
     assert same(bench.fork(take(short, "03:00", tmp_path / "checkpoint")).run(hours=5), longer)
 
 
+@pytest.mark.nightly
 def test_by_command_and_on_a_hub(disturbed: Outcome, pumpbench: Pumpbench, runs: Path) -> None:
     disturbed.write(runs / "whole")
     done = pumpbench("checkpoint", "whole@03:25", "--out", "instant")

@@ -112,6 +112,7 @@ def test_dropped_cgm_gives_the_same_bytes_between_vcan0_and_vcan1(pumpbench: Pum
     assert folder.info["trace_sha256"] == expected
 
 
+@pytest.mark.nightly
 def test_seed_and_strategy_change_the_bytes(pumpbench: Pumpbench, runs: Path) -> None:
     hashes = {
         run(pumpbench, "--days", "0.25", "--bus", "inproc", *more, out=runs / str(number)).info["trace_sha256"]

@@ -279,6 +279,7 @@ def run_folder_sha256(out: Path, *options: str) -> str:
     return str(json.loads((out / "run.json").read_text(encoding="utf-8"))["trace_sha256"])
 
 
+@pytest.mark.nightly
 def test_a_flooded_console_changes_no_frame_of_a_run_between_processes(tmp_path: Path) -> None:
     quiet = run_folder_sha256(tmp_path / "quiet")
     link = tmp_path / "tty"

@@ -184,6 +184,7 @@ def test_a_board_without_power_or_time_is_a_process_without_them(build: Path, pu
     assert len({folder.info["trace_sha256"] for folder in folders}) == 1
 
 
+@pytest.mark.nightly
 def test_one_board_on_its_serial_port_does_one_run_after_the_other(
     build: Path, pumpbench: Pumpbench, runs: Path
 ) -> None:

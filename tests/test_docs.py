@@ -73,7 +73,7 @@ LONG = (
 """Parts of commands that take minutes: run with PUMPBENCH_NIGHTLY=1."""
 
 
-EVERY_TIME = ("README.md", "docs/troubleshooting.md", "docs/extending.md")
+EVERY_TIME = ("README.md", "docs/troubleshooting.md")
 """Pages that are typed in `make test`; the others in a job of their own in CI, and in `make nightly`."""
 
 

@@ -366,6 +366,7 @@ def test_headings_are_in_order(folders: Path) -> None:
     assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
 
 
+@pytest.mark.nightly
 def test_the_same_folders_give_the_same_bytes(folders: Path) -> None:
     texts = [page.render(page.collect([folders / "clean", folders / "dropped"])) for _ in range(2)]
     assert texts[0] == texts[1]

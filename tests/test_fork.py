@@ -316,6 +316,7 @@ def test_another_build_that_does_the_same_is_the_same_run(lost: Outcome) -> None
     assert same(bench.fork(lost, "03:00").run(firmware=REFERENCE, bus="hub"), lost)
 
 
+@pytest.mark.nightly
 def test_another_firmware_takes_over_at_the_instant(lost: Outcome, caplog: pytest.LogCaptureFixture) -> None:
     fork = bench.fork(lost, "03:00").run(firmware=OPEN_LOOP, bus="hub")
     assert "answers otherwise than the recorded one since 00:00: CFG_ParamEcho" in caplog.text

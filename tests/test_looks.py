@@ -316,6 +316,7 @@ def test_the_viewer_draws_a_window_and_a_single_view(run: RunFolder, tmp_path: P
 
 
 @pytest.mark.usefixtures("no_vulkan")
+@pytest.mark.nightly
 def test_matplotlib_draws_the_same_files(run: RunFolder, tmp_path: Path) -> None:
     scene = scene_of(run.recording)
     shots = [Shot(tmp_path / f"{layout}.png", layout) for layout in LAYOUTS] + close_up_shots(scene, tmp_path / "new")

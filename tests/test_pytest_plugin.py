@@ -53,6 +53,7 @@ def test_a_failed_test_tells_the_story_and_leaves_its_recordings(pytester: pytes
     assert len(list(kept[1].glob("fault-*.png"))) == 1
 
 
+@pytest.mark.nightly
 def test_a_page_for_the_summary_of_ci_tells_of_this_session_only(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(TEST)
     for _ in range(2):

@@ -119,6 +119,7 @@ def test_a_patient_of_an_own_file_is_not_given_somebody_elses_controller(pumpben
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.nightly
 def test_patients_of_an_own_file_run_with_models_identified_from_them(pumpbench: Pumpbench, runs: Path) -> None:
     """A cohort of two, whose time constants differ from those of the ten: from the file to the closed loop."""
     from plant_server.physiology import patients

@@ -25,6 +25,7 @@ def study(pumpbench: Pumpbench, out: Path, *options: str) -> str:
     return done.stderr
 
 
+@pytest.mark.nightly
 def test_the_small_study(pumpbench: Pumpbench, runs: Path) -> None:
     study(pumpbench, runs / "one", "--workers", "1")
     for name in TABLES:

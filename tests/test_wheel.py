@@ -46,6 +46,7 @@ def test_it_has_every_file_of_the_packages_and_no_other(unpacked: Path) -> None:
     assert licences == {"LICENSE", "NOTICE"}
 
 
+@pytest.mark.nightly
 def test_a_run_with_what_is_in_it(unpacked: Path, tmp_path: Path) -> None:
     """Whatever a run opens comes from the wheel: sources, the DBC, patients, controller models."""
     code = (
