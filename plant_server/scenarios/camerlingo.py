@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv, ndtri
 
 from ..streams import stream
 from .announcing import Announcing
@@ -48,9 +47,21 @@ class Distribution(NamedTuple):
         return self.loc + self.scale * _STANDARD[self.family](max(share, 2.0**-54), self.shape)
 
 
+def _gamma(share: float, shape: float) -> float:
+    from scipy.special import gammaincinv  # noqa: PLC0415  only this scenario needs it, and a run is to start quickly
+
+    return float(gammaincinv(shape, share))
+
+
+def _lognormal(share: float, shape: float) -> float:
+    from scipy.special import ndtri  # noqa: PLC0415
+
+    return float(np.exp(shape * ndtri(share)))
+
+
 _STANDARD: dict[str, Callable[[float, float], float]] = {
-    "gamma": lambda share, shape: float(gammaincinv(shape, share)),
-    "lognorm": lambda share, shape: float(np.exp(shape * ndtri(share))),
+    "gamma": _gamma,
+    "lognorm": _lognormal,
     "fisk": lambda share, shape: (share / (1 - share)) ** (1 / shape),
     "genextreme": lambda share, shape: (1 - (-np.log(share)) ** shape) / shape,
 }

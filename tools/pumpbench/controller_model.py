@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
-from scipy.optimize import least_squares
 
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
@@ -135,6 +133,8 @@ def lags(taus: tuple[float, float, float], minutes: float = SAMPLE_MINUTES) -> t
     Returns:
         A (3x3, lower triangular) and B (3) of x(k+1) = A x(k) + B u(k); the output is x[2].
     """
+    from scipy.linalg import expm  # noqa: PLC0415
+
     system = np.zeros((4, 4))
     for i, tau in enumerate(taus):
         system[i, i] = -1 / tau
@@ -220,6 +220,8 @@ def _fit(
         return np.concatenate([response - unit * (unit @ response) / (unit @ unit) for response in scaled])
 
     bounds = (np.log([TAU_BOUNDS[0]] * 2), np.log([TAU_BOUNDS[1]] * 2))
+    from scipy.optimize import least_squares  # noqa: PLC0415  a third of the time a run takes to start
+
     fits = [least_squares(errors, np.log(start), bounds=bounds) for start in starts]
     tau_1, tau_2 = np.exp(min(fits, key=lambda fit: float(fit.cost)).x)
     unit = _unit_response(tau_1, tau_2, u)
