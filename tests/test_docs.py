@@ -152,6 +152,8 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     older.chmod(0o755)
     monkeypatch.setenv("COLUMNS", "120")
+    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):  # of the make that runs the tests
+        monkeypatch.delenv(name, raising=False)
     subprocess.run(["pumpbench", "run", "--days", "0.1", "--bus", "inproc"], cwd=tmp_path, check=True, timeout=60)
     return tmp_path
 
