@@ -41,7 +41,7 @@ NO_STATE: Final = {
         "run", "_with_reading", "_without_reading", "_pump_faults",
         "_call", "_roll", "late_answers",  # of the roll call, which the wall clock repeats
         "_origin", "_record", "_record_steps", "_row", "_said", "_rewinding", "_answers", "_otherwise", "_done",
-        "_heartbeat", "arrived",
+        "arrived",
     ),
     "plant_server.server._Body": ("_nominal", "_variability", "_carbs", "_meals", "_rules"),
     "plant_server.sensor.Sensor": (

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from pumpbench.cli_diff import IGNORE, OUT, RECORDS
-from pumpbench.terminal import EXIT_DEAD, EXIT_WRONG, console, progress_bar
+from pumpbench.cli_diff import IGNORE, OUT, RECORDS, tell
+from pumpbench.terminal import EXIT_DEAD, EXIT_WRONG, progress_bar
 
 
 def replay(
@@ -33,8 +33,6 @@ def replay(
 ) -> None:
     """Feed what a recorded device heard into a firmware. Exit status 1 if it answers otherwise, 3 if not at all."""
     from pumpbench import replay as replays  # noqa: PLC0415
-    from pumpbench.comparison import folder  # noqa: PLC0415
-    from pumpbench.files import write_file  # noqa: PLC0415
 
     with progress_bar() as bar:
         outcome = replays.replay(
@@ -48,15 +46,6 @@ def replay(
             reset_hook=reset_hook,
             progress=bar("turns"),
         )
-    if out is not None:
-        folder.write(outcome.report, out)
-    if json_file == "-":
-        typer.echo(outcome.json(), nl=False)
-    else:
-        if json_file is not None:
-            write_file(Path(json_file), outcome.json().encode())
-        console.print(outcome.text(), markup=False, soft_wrap=True)
-        if out is not None:
-            console.print(f"\n{folder.told(out)}", markup=False, soft_wrap=True)
+    tell(outcome, outcome.report, out, json_file)
     if not outcome.same:
         raise typer.Exit(EXIT_WRONG if outcome.silent is None else EXIT_DEAD)

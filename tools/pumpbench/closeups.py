@@ -51,10 +51,9 @@ class CloseUp:
     def text(self, trace: Trace) -> str:
         """What happened in it, as a table in Markdown."""
         rows = [
-            f"| {when} | {note.kind.lower()} | {what} |"
+            f"| {clock(note.time_s)} | {note.kind.lower()} | {note.what} |"
             for note in notes(trace)
             if self.start_s <= note.time_s <= self.end_s
-            for when, _, what in [note.text.partition("  ")]
         ]
         return "\n".join(["| when | | what |", "|---|---|---|", *rows, ""])
 

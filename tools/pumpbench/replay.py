@@ -23,7 +23,6 @@ import numpy as np
 from can_bus import codec
 from can_bus.faults import MemoryState, clock
 from can_bus.frame import MAX_DATA, Frame
-from plant_server.pump import NMT_BOOT_UP
 from plant_server.server import judge_version, stated_version
 from pumpbench.capture import FRAME_MICROSECONDS, Frames
 from pumpbench.comparison.align import Ignore, compare, contents
@@ -34,6 +33,7 @@ from pumpbench.conformance.device import Device
 from pumpbench.conformance.driver import Bench, Silent, Violation
 from pumpbench.conformance.registry import Need
 from pumpbench.identity import SOMEBODY_ELSES
+from pumpbench.rewind import boots_up
 from pumpbench.rig import SERIAL, RigError
 from pumpbench.trace import labels
 
@@ -323,7 +323,7 @@ def _turn(record: Record, rows: list[int]) -> Turn | None:
     answer = next((place for place in range(tokens[0], len(rows)) if _is_own(frames, rows[place])), len(rows))
     for place, row in enumerate(rows):
         frame = frames.frame(row)
-        if _boots(frame):
+        if boots_up(frame):
             following = rows[place + 1 : next((each for each in tokens if each > place), 0)]
             turn.heard.append(Power(_memory(record, turn, [frames.frame(each) for each in following])))
             turn.said.append(frame)
@@ -341,13 +341,6 @@ def _turn(record: Record, rows: list[int]) -> Turn | None:
 
 def _is_own(frames: Frames, row: int) -> bool:
     return int(frames.can_id[row]) in _said_by_device()
-
-
-def _boots(frame: Frame) -> bool:
-    heartbeat = codec.message("HB_CTRL")
-    if frame.can_id != heartbeat.can_id or len(frame.data) != heartbeat.length:
-        return False
-    return heartbeat.unpack(frame.data)["NmtCtrl"] == NMT_BOOT_UP
 
 
 def _memory(record: Record, turn: Turn, following: list[Frame]) -> MemoryState:

@@ -9,7 +9,7 @@ import itertools
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Phase
 from plant_server.pump import NMT_BOOT_UP
 from plant_server.server import PlantServer, Run
-from pumpbench.capture import Frames
+from pumpbench.capture import Frames, concatenated
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,7 +58,7 @@ class Origin:
         """The frames of one channel up to the instant; without a gateway both buses are the same."""
         chosen = self.frames.select(before(self.frames, self.step))
         known = chosen.select(chosen.channel == (channel if (self.frames.channel == PLANT).any() else DEVICE))
-        return Frames(**{**_columns(known), "channel": np.full(len(known), channel, "u1")})
+        return replace(known, channel=np.full(len(known), channel, "u1"))
 
     def calibration(self) -> dict[int, int]:
         """CfgIndex and raw value of what the device was flashed with, in that order."""
@@ -70,10 +70,6 @@ class Origin:
             index = values.pop("CfgIndex")
             flashed[index] = values[message.pages[index][0].name]
         return flashed
-
-
-def _columns(frames: Frames) -> dict[str, Any]:
-    return {each.name: getattr(frames, each.name) for each in fields(frames)}
 
 
 def before(frames: Frames, step: int) -> "NDArray[np.bool_]":
@@ -106,7 +102,6 @@ class RewoundPlant(PlantServer):
         self._answers: list[Frame] = []  # of a device that is not asked, in this turn
         self._otherwise = False  # it has answered otherwise than the record
         self._done = codec.message("SYNC_Done")
-        self._heartbeat = codec.message("HB_CTRL")
 
     def receive(self, frame: Frame) -> Sequence[Frame]:
         """As `PlantServer.receive`.
@@ -176,8 +171,8 @@ class RewoundPlant(PlantServer):
         return answer
 
     def _ends_turn(self, frame: Frame) -> bool:
-        if frame.can_id == self._heartbeat.can_id and len(frame.data) == self._heartbeat.length:
-            return self._heartbeat.unpack(frame.data)["NmtCtrl"] == NMT_BOOT_UP
+        if boots_up(frame):
+            return True
         if frame.can_id != self._done.can_id or len(frame.data) != self._done.length:
             return False
         return self._done.unpack(frame.data)["DoneStepIndex"] == self.step
@@ -207,6 +202,14 @@ class RewoundPlant(PlantServer):
         return _text(self._record[self._row]) if self._row < len(self._record) else "nothing"
 
 
+def boots_up(frame: Frame) -> bool:
+    """Whether the device says with this frame that it has started anew."""
+    heartbeat = codec.message("HB_CTRL")
+    if frame.can_id != heartbeat.can_id or len(frame.data) != heartbeat.length:
+        return False
+    return heartbeat.unpack(frame.data)["NmtCtrl"] == NMT_BOOT_UP
+
+
 def _text(frame: Frame | None) -> str:
     from pumpbench.bench import frame_text  # noqa: PLC0415
 
@@ -232,12 +235,7 @@ def join(origin: Origin, frames: Frames) -> Frames:
         _check(recorded.select(_asked(recorded, origin)), again.select(_asked(again, origin)))
         parts.append(recorded)
     parts.append(frames.select(~past))
-    whole = Frames(*(np.concatenate(column) for column in zip(*map(_values, parts), strict=True)))
-    return whole.select(np.lexsort((whole.channel, whole.step)))
-
-
-def _values(frames: Frames) -> list[Any]:
-    return list(_columns(frames).values())
+    return concatenated(parts).in_order()
 
 
 def _asked(frames: Frames, origin: Origin) -> "NDArray[np.bool_]":

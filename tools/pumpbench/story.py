@@ -90,8 +90,13 @@ class Note:
 
     time_s: float
     kind: str
-    text: str
+    what: str
     colour: tuple[int, int, int]
+
+    @property
+    def text(self) -> str:
+        """When and what."""
+        return f"{clock(self.time_s)}  {self.what}"
 
 
 @dataclass(frozen=True)
@@ -162,8 +167,7 @@ def notes(trace: Trace, *, running: bool = False) -> list[Note]:
     for start, text in state_changes(trace, "CtrlState", "CTRL_Status"):
         if text:
             found.append(Note(start, "STATE", f"firmware {text}", STATE_COLOURS["CtrlState"].get(text, GREY)))
-    found.sort(key=lambda note: note.time_s)
-    return [Note(note.time_s, note.kind, f"{clock(note.time_s)}  {note.text}", note.colour) for note in found]
+    return sorted(found, key=lambda note: note.time_s)
 
 
 def state_changes(trace: Trace, signal: str, message: str) -> list[tuple[float, str]]:

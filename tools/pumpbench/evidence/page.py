@@ -181,7 +181,7 @@ def render(material: Material) -> str:
 def _section(number: int, run: Evidence) -> dict[str, Any]:
     """What the page tells of a run beyond the fields of `Evidence`."""
     events = [] if run.trace is None else notes(run.trace)
-    rows = [(note.time_s, note.kind.lower(), note.text.partition("  ")[2]) for note in events]
+    rows = [(note.time_s, note.kind.lower(), note.what) for note in events]
     rows += [
         (entry["step"] * float(STEP_SECONDS), "hazard", f"{entry['hazard']}: {hazards.NAMES[entry['hazard']]}")
         for entry in run.safety.get("first_hazards", ())

@@ -7,7 +7,7 @@ lanes, what happened as text, the bus with its error counters, and the table of 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -153,6 +153,12 @@ class Logger:
         """A page of text, for the whole recording."""
         self.recording.log(path, self.rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
+    def texts(self, path: str, lines: Sequence[tuple[float, str, str, Colour]]) -> None:
+        """Lines of a log: time (simulated s), text, level, colour."""
+        if lines:
+            time_s, text, level, colour = zip(*lines, strict=True)
+            self.send(path, np.array(time_s), self.rr.TextLog.columns(text=text, level=level, color=colour))
+
     def states(self, path: str, changes: list[tuple[float, str]], colours: Mapping[str, Colour]) -> None:
         """A lane: when each state begins (simulated s) and its name, "" for a gap; colours by name."""
         palette = self.palette(path, {name: colours.get(name, hue(name)) for _, name in changes if name})
@@ -289,17 +295,7 @@ class Run(Logger):
 
     def log(self, trace: Trace) -> None:
         """What happened, as text."""
-        lines = self.fresh_notes(trace)
-        if lines:
-            self.send(
-                "log",
-                np.array([line.time_s for line in lines]),
-                self.rr.TextLog.columns(
-                    text=[line.text for line in lines],
-                    level=[line.kind for line in lines],
-                    color=[line.colour for line in lines],
-                ),
-            )
+        self.texts("log", [(line.time_s, line.text, line.kind, line.colour) for line in self.fresh_notes(trace)])
 
     def bus(self, trace: Trace, frames: Frames) -> None:
         """How much there was on the wire, which messages, what was damaged or missed."""

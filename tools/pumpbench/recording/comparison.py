@@ -141,16 +141,7 @@ class _Scene:
                 path = f"{folder}/{number:02}_{lane.name.replace(', ', '_').replace(' ', '_')}"
                 logger.states(path, changes, {bar.text: _rgb(bar.colour) for bar in lane.bars})
         lines = frame_lines(self.report, MAX_LINES)
-        if lines:
-            logger.send(
-                "frames",
-                np.array([line.time_s for line in lines]),
-                logger.rr.TextLog.columns(
-                    text=[line.text for line in lines],
-                    level=[named[line.kind] for line in lines],
-                    color=[colours[line.kind] for line in lines],
-                ),
-            )
+        logger.texts("frames", [(line.time_s, line.text, named[line.kind], colours[line.kind]) for line in lines])
 
     def _mark(self, logger: Logger, path: str, low: float, high: float) -> None:
         """A vertical line where the runs part: two points as good as at one time."""
