@@ -42,6 +42,7 @@ def silences(steps: str) -> str:
         ("0 - 0 0 0 0", "010123"),
         ("0 00 00 0", "0123"),
         ("0 01 1 0", "0010"),  # two in a step, the second before its time
+        ("0 11 1", "001"),  # two in a step, the second of which repeats the first
         ("- 1 1", "001"),
     ],
 )

@@ -25,6 +25,18 @@ def hear(meal: dict[str, int]) -> Meals:
     return meals
 
 
+# ---- one per step
+
+
+@pytest.mark.parametrize("kind", [CARBS, HYPO, CANCEL])
+def test_a_second_announcement_of_a_step_waits_until_the_user_repeats_it(kind: int) -> None:
+    meals = hear(announced(7, kind))
+    meals.hear(announced(8))
+    assert (meals.take(), meals.last) == ((CARBS, 80) if kind == CARBS else NOTHING, 7)
+    meals.hear(announced(8))
+    assert (meals.take(), meals.last) == ((CARBS, 80), 8)
+
+
 # ---- numbers
 
 

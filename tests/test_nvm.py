@@ -240,8 +240,10 @@ def test_both_banks_damaged() -> None:
 
 def test_the_only_record_damaged_is_not_blank() -> None:
     memory = RamMemory(SIZE)
-    Nvm(memory, CAPACITY).store([1])
+    nvm = Nvm(memory, CAPACITY)
+    assert nvm.store([1]) and nvm.intact()
     memory.flip(8)
+    assert not nvm.intact()
     nvm = Nvm(memory, CAPACITY)
     assert (nvm.load(), nvm.blank, nvm.damaged) == (None, False, True)
 
