@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from warm_start import WarmStart
 
 ROOT = Path(__file__).parents[1]
 
@@ -64,13 +65,27 @@ def runs(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
 Pumpbench = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
+@pytest.fixture(scope="session")
+def warm_start(request: pytest.FixtureRequest) -> Iterator[WarmStart | None]:
+    """What starts commands; None where each is to start from nothing, at night and for the count of lines."""
+    if os.environ.get("PUMPBENCH_NIGHTLY") or request.config.pluginmanager.has_plugin("_cov"):
+        yield None
+        return
+    server = WarmStart()
+    yield server
+    server.close()
+
+
 @pytest.fixture
-def pumpbench(runs: Path) -> Pumpbench:
+def pumpbench(runs: Path, warm_start: WarmStart | None) -> Pumpbench:
     """Run the command line as a user does; returns the finished process."""
 
     def call(*arguments: str | Path, timeout: float = 120.0) -> "subprocess.CompletedProcess[str]":
+        words = [str(each) for each in arguments]
+        if warm_start is not None:
+            return warm_start.run(words, runs, timeout)
         return subprocess.run(
-            [sys.executable, "-m", "pumpbench", *map(str, arguments)],
+            [sys.executable, "-m", "pumpbench", *words],
             cwd=runs,
             capture_output=True,
             text=True,
