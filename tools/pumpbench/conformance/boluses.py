@@ -12,7 +12,7 @@ from can_bus import codec
 from can_bus.faults.fields import repaired, with_raw
 from can_bus.frame import Frame
 from can_bus.lockstep import Node
-from pumpbench.calibration import with_crc
+from pumpbench.conformance.driver import changed
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import MEALTIME, Dut
 
@@ -36,9 +36,18 @@ PROGRAM_ACKS = {ACK_OF[drug, PROGRAM]: drug for drug in DRUGS}
 COMMIT_ACKS = {ACK_OF[drug, COMMIT]: drug for drug in DRUGS}
 
 
+FIRST = 6
+"""Step of the first meal: the device is in Auto by then."""
+
+
 def meal_mode(dut: Dut) -> str:
-    """A mode of this device that answers a meal with a bolus, insulin alone if there is a choice."""
+    """A mode of this device that answers a meal with a bolus, insulin alone if there is a choice; it has "boluses"."""
     return next(name for name in MEALTIME if name in dut.offers)
+
+
+def carbs_mode(dut: Dut) -> str | None:
+    """A mode with boluses for announced carbohydrates, if the device has one."""
+    return next((name for name in ("ma", "s3") if name in dut.offers), None)
 
 
 class Command(NamedTuple):
@@ -90,11 +99,14 @@ def programs(loop: Loop, drug: int | None = None) -> list[Command]:
     return list(first.values())
 
 
+def bolus_steps(loop: Loop, *operations: int) -> list[int]:
+    """Steps in which a PUMP_BolusCmd with one of these operations was sent."""
+    return [each.step for each in commands(loop) if each.op in operations]
+
+
 def flash(loop: Loop, **raws: int) -> None:
     """Give the device another calibration, by signal name, for a run that has not begun."""
-    index = {fields[0].name: number for number, fields in codec.message("CFG_Param").pages.items()}
-    changed = with_crc(dict(loop.plant.run.calibration) | {index[name]: raw for name, raw in raws.items()})
-    loop.plant.run = loop.plant.run._replace(calibration=changed)
+    loop.plant.run = loop.plant.run._replace(calibration=changed(loop.plant.run.calibration, **raws))
 
 
 Change = Callable[[str, Values], Sequence[Values]]
@@ -129,18 +141,19 @@ class PowerCut:
     Args:
         dut: can be restarted.
         device: the same, as a loop sees it.
-        at: whether power fails in place of hearing this frame.
+        when: whether power fails in place of hearing this frame (name, raw values); asked until it is so.
     """
 
     finished = False
 
-    def __init__(self, dut: Dut, device: Node, at: Callable[[Frame], bool]) -> None:
-        self._dut, self._device, self._at = dut, device, at
-        self.happened = False
+    def __init__(self, dut: Dut, device: Node, when: Callable[[str, Values], bool]) -> None:
+        self._dut, self._device, self._when = dut, device, when
+        self._done = False
 
     def receive(self, frame: Frame) -> Sequence[Frame]:
         """What the device says, be it that it has started."""
-        if not self.happened and self._at(frame):
-            self.happened = True
+        message = codec.messages_by_id().get(frame.can_id)
+        if not self._done and message is not None and self._when(message.name, message.unpack(frame.data)):
+            self._done = True
             return self._dut.restart()
         return self._device.receive(frame)

@@ -11,7 +11,7 @@ the mU and knows no boluses; `loop.Loop` has the whole plant.
 
 import enum
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import dbc
@@ -50,6 +50,13 @@ class Op(enum.IntEnum):
 GLUCOSE = 1200
 """0.1 mg/dL, the target of all adults: a firmware at rest asks for its schedule."""
 
+HIGH = GLUCOSE + 800
+"""0.1 mg/dL: calls for insulin above the schedule while it stays."""
+
+SUSPEND = codec.choice("MODE_Cmd", "SuspendRequest", "Suspend")
+RESUME = codec.choice("MODE_Cmd", "SuspendRequest", "Resume")
+PENDING = codec.choice("CTRL_Alarm", "CtrlAlarmState", "Pending")
+
 SIM_TIME_SNA = 268435455
 """SimTime of the steps after 8.5 years, which it cannot hold."""
 
@@ -74,6 +81,9 @@ def expect(holds: bool, rule: str) -> None:
 
 SENT_BY_CTRL = tuple(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
 
+HEARD_BY_CTRL = tuple(each for each in dbc.load().messages if "CTRL" in each.receivers and each.name != "UDS_Request")
+"""What CTRL receives; the diagnostics are a protocol of their own."""
+
 
 @functools.cache
 def _calibration(patient: str) -> tuple[tuple[int, int], ...]:
@@ -82,8 +92,23 @@ def _calibration(patient: str) -> tuple[tuple[int, int], ...]:
 
 def calibration(patient: str = "adult#001", **raws: int) -> dict[int, int]:
     """The calibration of a patient, index -> raw value with the CRC last; `raws` by signal name change it."""
-    index = {fields[0].name: number for number, fields in codec.message("CFG_Param").pages.items()}
-    return with_crc(dict(_calibration(patient)) | {index[name]: raw for name, raw in raws.items()})
+    return changed(dict(_calibration(patient)), **raws)
+
+
+def changed(flash: Mapping[int, int], **raws: int) -> dict[int, int]:
+    """A calibration with these raw values by signal name, and the CRC that goes with them."""
+    return with_crc(dict(flash) | {parameter_index(name): raw for name, raw in raws.items()})
+
+
+def parameter_index(name: str) -> int:
+    """CfgIndex of a parameter."""
+    return next(index for index, known in parameter_names().items() if known == name)
+
+
+@functools.cache
+def parameter_names() -> dict[int, str]:
+    """CfgIndex -> the signal that holds the value."""
+    return {index: fields[0].name for index, fields in codec.message("CFG_Param").pages.items()}
 
 
 @dataclass
@@ -111,6 +136,10 @@ class Turn:
         """The alarm frames of one code, by number or by its name in the DBC."""
         return [alarm for alarm in self.all("CTRL_Alarm") if alarm["CtrlAlarmCode"] == alarm_code(code)]
 
+    def pending(self, code: int | str) -> bool:
+        """Whether an alarm of this code is told as pending."""
+        return any(alarm["CtrlAlarmState"] == PENDING for alarm in self.alarms(code))
+
     @property
     def names(self) -> list[str]:
         """Names of all frames in order."""
@@ -134,9 +163,24 @@ class Turn:
         return self.command["InsulinRate"]
 
     @property
+    def pramlintide(self) -> int:
+        """The pramlintide rate (0.1 ug/h) that the pump runs after this turn: only a set-point has one."""
+        return self.command["PramlintideRate"] if self.command["BasalOp"] == Op.SET_RATE else 0
+
+    @property
     def status(self) -> dict[str, int]:
         """CTRL_Status."""
         return self.one("CTRL_Status")
+
+    @property
+    def iob(self) -> int:
+        """InsulinOnBoard, 0.01 U."""
+        return self.status["InsulinOnBoard"]
+
+    @property
+    def used(self) -> int:
+        """CgmSampleSeq of the newest sample the device says it has used; 65535: none."""
+        return self.status["LastCgmSeq"]
 
     @property
     def state(self) -> State:
@@ -282,29 +326,29 @@ class Bench:
 
     def configure(self, flash: dict[int, int], mode: int | None = None) -> Turn:
         """Flash parameters, ask for a mode, and give the turn for it."""
-        names = codec.message("CFG_Param").pages
         for index, raw in flash.items():
-            self.send("CFG_Param", CfgIndex=index, **{names[index][0].name: raw})
+            self.send("CFG_Param", CfgIndex=index, **{parameter_names()[index]: raw})
         if mode is not None:
-            self.send("MODE_Cmd", ModeRequest=mode, ModeCmdSeq=0, SuspendRequest=0)
+            self.request(0, 0, mode)
         turn = self.token(Phase.CONFIG, 0)
         status = turn.done["DoneStatus"]
         expect(status == Done.OK, f"DoneStatus Ok after the calibration; {status} came")
         return turn
 
+    @property
+    def number(self) -> int:
+        """CgmSampleSeq of the step to come."""
+        return self.k % 65535
+
     def sample(self, glucose: int = GLUCOSE, **values: int) -> Frame:
         """CGM_Reading of the step to come, or with fields of one's own."""
-        fields = {
-            "CgmState": 1,
-            "GlucoseConc": glucose,
-            "CgmSampleSeq": self.k % 65535,
-            "CgmSampleStep": self.k % 256,
-        }
+        fields = {"CgmState": 1, "GlucoseConc": glucose, "CgmSampleSeq": self.number, "CgmSampleStep": self.k % 256}
         return self.frame("CGM_Reading", **(fields | values))
 
-    def status(self) -> Frame:
-        """PUMP_Status of the step to come."""
-        return self.frame("PUMP_Status", PumpState=3, InsulinReservoir=2000, PramReservoir=2000, PumpBattery=90)
+    def status(self, **values: int) -> Frame:
+        """PUMP_Status of the step to come, or with fields of one's own."""
+        fields = {"PumpState": 3, "InsulinReservoir": 2000, "PramReservoir": 2000, "PumpBattery": 90}
+        return self.frame("PUMP_Status", **(fields | values))
 
     def delivered(self, **values: int) -> Frame:
         """PUMP_Delivered of the step to come, or with fields of one's own."""
@@ -338,11 +382,32 @@ class Bench:
         state = self.status()
         total = self.delivered() if isinstance(totals, bool) else totals
         frames = [*cgm, *([state] if status else ()), *([total] if totals is not False else ()), *also]
+        return self.instant(*frames)
+
+    def instant(self, *frames: Frame, off: int = 0) -> Turn:
+        """One step with just these frames, and a clock that is so many seconds off."""
         self.give(*frames)
-        turn = self.token(Phase.STEP, self.k, min(self.k * STEP_SECONDS, SIM_TIME_SNA))
+        turn = self.token(Phase.STEP, self.k, min(self.k * STEP_SECONDS + off, SIM_TIME_SNA))
         self.obey(turn)
         self.k += 1
         return turn
+
+    def request(self, number: int, suspend: int, mode: int = NMA) -> None:
+        """The user suspends, resumes, or only asks for a mode (`suspend` 0)."""
+        self.send("MODE_Cmd", ModeRequest=mode, ModeCmdSeq=number, SuspendRequest=suspend)
+
+    def confirm(self, turn: Turn) -> None:
+        """The user confirms whatever is pending."""
+        for alarm in turn.all("CTRL_Alarm"):
+            if alarm["CtrlAlarmState"] == PENDING:
+                self.send("UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"])
+
+    def commanded(self, turn: Turn) -> float:
+        """The insulin rate (0.005 U/h) that the pump runs after this turn: the set-point, none, or its own schedule."""
+        command = turn.command
+        rates = {Op.SET_RATE: float(command["InsulinRate"]), Op.SUSPEND: 0.0, Op.RESUME_SCHEDULE: self.basal / 5}
+        expect(command["BasalOp"] in rates, f"SetRate, Suspend or ResumeSchedule; BasalOp {command['BasalOp']} came")
+        return rates[Op(command["BasalOp"])]
 
     def obey(self, turn: Turn) -> None:
         """The pump takes the commands of a turn, and runs for five minutes."""

@@ -12,25 +12,11 @@ from plant_server import mechanism
 from plant_server.chamber import Chamber, Occlusion
 from plant_server.pump import Pump, PumpSettings
 from pumpbench.calibration import MODES
-from pumpbench.conformance.checks.ladder import (
-    COMMIT,
-    PENDING,
-    PROGRAM,
-    SUSPEND,
-    bolus_steps,
-    commanded,
-    damaged,
-    expect_state,
-    meal_mode,
-    overload,
-    pending,
-    pramlintide,
-    request,
-)
-from pumpbench.conformance.checks.sensor import HIGH, dosing
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, State, Turn, alarm_code, expect
+from pumpbench.conformance.boluses import COMMIT, COMMIT_ACKS, PROGRAM, bolus_steps, meal_mode
+from pumpbench.conformance.driver import GLUCOSE, HIGH, NMA, PENDING, SUSPEND, Bench, State, Turn, alarm_code, expect
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, NotOffered, check
+from pumpbench.conformance.situations import damaged, dosing, expect_state, overload
 
 INACTIVE: Final = codec.choice("CTRL_Alarm", "CtrlAlarmState", "Inactive")
 CONFIRMED: Final = codec.choice("CTRL_Alarm", "CtrlAlarmState", "Confirmed")
@@ -42,7 +28,6 @@ ANSWERS: Final = {
 PRIORITIES: Final = ("Info", "Low", "Medium", "High")
 
 SENSOR_FAULT: Final = codec.choice("CGM_Reading", "CgmState", "SensorFault")
-OCCLUDED: Final = codec.choice("PUMP_Status", "InsulinOcclusion", "Occluded")
 
 WITHIN: Final = 1
 """Steps after the causing frame in which an alarm has to come at the latest (ALM-03)."""
@@ -54,21 +39,12 @@ COMMOTION: Final = ("UrgentLow", "PumpLost", "CgmImplausible", "E2EFault", "Cloc
 # ---- causes
 
 
-def instant(bench: Bench, *frames: Frame, off: int = 0) -> Turn:
-    """One step with just these frames, and a clock that is so many seconds off."""
-    bench.give(*frames)
-    turn = bench.token(Phase.STEP, bench.k, bench.k * STEP_SECONDS + off)
-    bench.obey(turn)
-    bench.k += 1
-    return turn
-
-
 def commotion(bench: Bench) -> Turn:
     """A silent pump, and then in its third step all the causes of `COMMOTION` at once."""
     for _ in range(2):
-        instant(bench, bench.sample())
+        bench.instant(bench.sample())
     ahead = bench.sample(GLUCOSE, CgmSampleStep=(bench.k + 5) % 256)
-    return instant(bench, ahead, bench.sample(500), damaged(bench.delivered()), off=3600)
+    return bench.instant(ahead, bench.sample(500), damaged(bench.delivered()), off=3600)
 
 
 class Listener:
@@ -116,7 +92,7 @@ def how_alarms_are_told(dut: Dut) -> None:
         bench.run(6)
         turns = [listener.hear(commotion(bench), "with five causes at once")]
         turns += [
-            listener.hear(instant(bench, bench.sample(500)), "with five causes at once")
+            listener.hear(bench.instant(bench.sample(500)), "with five causes at once")
             for _ in range(dut.settings.alarms.out_within - 1)
         ]
         told = {alarm["CtrlAlarmCode"] for turn in turns for alarm in turn.all("CTRL_Alarm")}
@@ -136,7 +112,7 @@ def _answer_two(bench: Bench, listener: Listener, turn: Turn) -> None:
     for code, state in asked.items():
         answer(bench, turn.alarms(code)[0], state)
     for k in range(3):
-        turn = listener.hear(instant(bench, bench.sample(500)), "after the user has answered")
+        turn = listener.hear(bench.instant(bench.sample(500)), "after the user has answered")
         for code, state in asked.items():
             states = [alarm["CtrlAlarmState"] for alarm in turn.alarms(code)]
             expect(
@@ -157,7 +133,7 @@ def how_urgent_alarms_are(dut: Dut) -> None:
     found += commotion(bench).all("CTRL_Alarm")
     found += bench.step().all("CTRL_Alarm")
     found += _of_a_tour(dut)
-    if meal_mode(dut) is not None:
+    if "boluses" in dut.offers:
         provoked.add("DeliveryUncertain")
         found += _of_missing_answers(dut)
     if "uds" in dut.offers:
@@ -189,23 +165,17 @@ def _of_a_tour(dut: Dut) -> list[Values]:
     bench = dut.bench()
     bench.run(4)
     turns = [bench.step(cgm=[]) for _ in range(dut.settings.ladder.safe)]
-    request(bench, 1, SUSPEND)
+    bench.request(1, SUSPEND)
     turns.append(bench.step())
     return [alarm for turn in turns for alarm in turn.all("CTRL_Alarm")]
 
 
 def _of_missing_answers(dut: Dut) -> list[Values]:
     """A meal's bolus whose Commit nobody answers."""
-    mode = meal_mode(dut)
-    assert mode is not None
-    commit_acks = (
-        codec.choice("PUMP_Ack", "AckFor", "InsulinBolusCommit"),
-        codec.choice("PUMP_Ack", "AckFor", "PramBolusCommit"),
-    )
-    loop = dut.loop(mode, meals=[(12, 60.0)], steps=15)
+    loop = dut.loop(meal_mode(dut), meals=[(12, 60.0)], steps=15)
 
     def wire(name: str, values: Values, _frame: Frame) -> Sequence[Frame] | None:
-        return [] if name == "PUMP_Ack" and values["AckFor"] in commit_acks else None
+        return [] if name == "PUMP_Ack" and values["AckFor"] in COMMIT_ACKS else None
 
     loop.to_device = wire
     return loop.play().all("CTRL_Alarm")
@@ -234,7 +204,7 @@ def how_soon_alarms_come(dut: Dut) -> None:
         pump_there = state != State.DELIVERY_UNCERTAIN
         turn = bench.step(low, status=pump_there, totals=pump_there)
         expect(
-            pending(turn, "UrgentLow"), f"UrgentLow in the step of {low / 10:g} mg/dL in {state.name}; it did not come"
+            turn.pending("UrgentLow"), f"UrgentLow in the step of {low / 10:g} mg/dL in {state.name}; it did not come"
         )
     bench = dosing(dut)
     _expect_alarm(_two(bench, damaged(bench.sample(HIGH))), "E2EFault", "a frame with a wrong CRC")
@@ -243,7 +213,7 @@ def how_soon_alarms_come(dut: Dut) -> None:
         _two(bench, bench.sample(HIGH, CgmSampleStep=(bench.k + 5) % 256)), "CgmImplausible", "a sample of later"
     )
     bench = dosing(dut)
-    turns = [instant(bench, bench.sample(HIGH), bench.status(), bench.delivered(), off=3600), bench.step(HIGH)]
+    turns = [bench.instant(bench.sample(HIGH), bench.status(), bench.delivered(), off=3600), bench.step(HIGH)]
     _expect_alarm(turns, "ClockJump", "a clock that is an hour ahead")
 
 
@@ -253,7 +223,7 @@ def _two(bench: Bench, reading: Frame) -> list[Turn]:
 
 def _expect_alarm(turns: Iterable[Turn], code: str, cause: str) -> None:
     expect(
-        any(pending(turn, code) for turn in turns), f"the alarm {code} within {WITHIN} step of {cause}; it did not come"
+        any(turn.pending(code) for turn in turns), f"the alarm {code} within {WITHIN} step of {cause}; it did not come"
     )
 
 
@@ -266,7 +236,7 @@ def _in_state(dut: Dut, state: State) -> Bench:
         for _ in range(faulty[state]):
             turn = bench.step(cgm=[bench.sample(CgmState=SENSOR_FAULT, GlucoseConc=8191)])
     elif state == State.SUSPENDED:
-        request(bench, 1, SUSPEND)
+        bench.request(1, SUSPEND)
         turn = bench.step()
     elif state == State.DELIVERY_UNCERTAIN:
         for _ in range(4):
@@ -285,7 +255,7 @@ def alarms_come_again(dut: Dut) -> None:
             turn = bench.step(cgm=[])
         _expect_again(bench, turn, "CgmLost", state, alarms.again, cgm=[])
     bench = dosing(dut)
-    request(bench, 1, SUSPEND)
+    bench.request(1, SUSPEND)
     _expect_again(bench, bench.step(), "StateChange", CONFIRMED, alarms.suspended_again)
 
 
@@ -314,21 +284,20 @@ def an_occlusion(dut: Dut) -> None:
     bench.run(12)
     for _ in range(12):
         before = bench.total
-        turn = instant(bench, bench.sample(), _occluded(bench), bench.delivered())
+        turn = bench.instant(bench.sample(), bench.status(InsulinOcclusion=Occlusion.OCCLUDED), bench.delivered())
         bench.total = before  # nothing arrives
-        drug = pramlintide(turn)
+        drug = turn.pramlintide
         expect(drug == 0, f"no pramlintide while the insulin line is occluded; {drug} came")
     missed = bench.basal / 5
-    extra = sum(max(commanded(bench, bench.step()) - missed, 0.0) for _ in range(12)) / 12
+    extra = sum(max(bench.commanded(bench.step()) - missed, 0.0) for _ in range(12)) / 12
     expect(
         extra <= missed / 4,
         "nothing made up after an hour of occlusion at a steady glucose: within an hour at most a quarter of the "
         f"{missed:g} that were missed; {extra:g} came",
     )
-    meals = meal_mode(dut)
-    if meals is None:
+    if "boluses" not in dut.offers:
         return
-    loop = dut.loop(meals, meals=[(16, 60.0)], steps=36)
+    loop = dut.loop(meal_mode(dut), meals=[(16, 60.0)], steps=36)
     line = loop.plant.pump.insulin
     _at_steps(loop, {9: lambda: _block(line), 21: lambda: line.release(lost=True)})
     loop.play()
@@ -338,11 +307,6 @@ def an_occlusion(dut: Dut) -> None:
         f"no bolus for a meal while the line is occluded, nor later for that meal; one came in step {begun[:1]}",
     )
     expect(loop.ledgers_close(), "a ledger that closes after an occlusion")
-
-
-def _occluded(bench: Bench) -> Frame:
-    usual = {"PumpState": 3, "InsulinReservoir": 2000, "PramReservoir": 2000, "PumpBattery": 90}
-    return bench.frame("PUMP_Status", InsulinOcclusion=OCCLUDED, **usual)
 
 
 def _block(line: Chamber) -> None:
@@ -398,9 +362,8 @@ def what_runs_out(dut: Dut) -> None:
         in_time = [step for step in raised if since <= step <= since + WITHIN]
         expect(bool(in_time), f"{code} in step {since}, with {field} at {limit}; it came in steps {raised}")
     expect(loop.ledgers_close(), "a ledger that closes when reservoirs and battery are empty")
-    meals = meal_mode(dut)
-    if meals is not None:
-        _expect_bolus_within_what_is_left(dut, meals)
+    if "boluses" in dut.offers:
+        _expect_bolus_within_what_is_left(dut)
 
 
 def _leave(chamber: Chamber, volume: float) -> None:
@@ -427,9 +390,9 @@ def _raised(loop: Loop, code: str) -> list[int]:
     return sorted(first.values())
 
 
-def _expect_bolus_within_what_is_left(dut: Dut, mode: str) -> None:
+def _expect_bolus_within_what_is_left(dut: Dut) -> None:
     """A meal of 60 g with 2 U in the reservoir."""
-    loop = dut.loop(mode, meals=[(12, 60.0)], steps=16)
+    loop = dut.loop(meal_mode(dut), meals=[(12, 60.0)], steps=16)
     _at_steps(loop, {10: lambda: _leave(loop.plant.pump.insulin, 2.0)})
     loop.play()
     left = {step: values["InsulinReservoir"] * 10 for step, values in loop.steps_of("PUMP_Status")}  # 0.01 U

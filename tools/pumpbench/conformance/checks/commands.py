@@ -18,6 +18,7 @@ from pumpbench.conformance.boluses import (
     DOSE,
     DRUGS,
     DUPLICATE,
+    FIRST,
     INSULIN,
     PROGRAM,
     PROGRAM_ACKS,
@@ -36,9 +37,6 @@ from pumpbench.conformance.registry import MEALTIME, Dut, check
 
 EVERY: Final = 4
 """Steps between two meals, so that what became of one is settled before the next."""
-
-FIRST: Final = 6
-"""Step of the first meal: the device is in Auto by then."""
 
 
 def result(name: str) -> int:
@@ -208,13 +206,13 @@ def _without(lost: Container[int]) -> Change:
     return lambda _name, ack: [] if ack["AckFor"] in lost else [ack]
 
 
-def _nth(name: str, count: int, which: Callable[[Values], bool]) -> Callable[[Frame], bool]:
+def _nth(name: str, count: int, which: Callable[[Values], bool]) -> Callable[[str, Values], bool]:
     """Whether a frame is the nth of these."""
-    message, left = codec.message(name), count
+    left = count
 
-    def is_it(frame: Frame) -> bool:
+    def is_it(said: str, values: Values) -> bool:
         nonlocal left
-        left -= frame.can_id == message.can_id and which(message.unpack(frame.data))
+        left -= said == name and which(values)
         return left == 0
 
     return is_it

@@ -9,10 +9,11 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Phase
 from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES
-from pumpbench.conformance.checks.e2e import carbs_mode, difference, idle_boluses
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, Op, expect
+from pumpbench.conformance.boluses import COMMIT, carbs_mode
+from pumpbench.conformance.driver import GLUCOSE, Bench, Op, expect
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, check
+from pumpbench.conformance.situations import difference, idle_boluses
 
 REQUEST: Final = codec.message("UDS_Request")
 RESPONSE: Final = codec.message("UDS_Response")
@@ -22,8 +23,6 @@ STEPS: Final = 16
 READ_DATA: Final = 0x22
 FIRST, FLOW_CONTROL = 1, 3
 """Kinds of frames of ISO-TP."""
-
-COMMIT: Final = codec.choice("PUMP_BolusCmd", "BolusOp", "Commit")
 
 HISTORY: Final = 0x4000
 """DID of the record whose step leaves nothing when divided by the 288 steps of a day; docs/diagnostics.md."""
@@ -81,7 +80,7 @@ def _anything(rng: random.Random) -> bytes:
 def _run(dut: Dut, ask: Callable[[Bench, int], None]) -> list[list[tuple[str, Values]]]:
     """What the device says in its turns, with a tester before each."""
     strategy = carbs_mode(dut)
-    bench = dut.bench(mode=NMA if strategy is None else MODES[strategy])
+    bench = dut.bench(mode=MODES[strategy or "nma"])
     said = []
     for k in range(STEPS):
         if k == STEPS // 2:

@@ -7,12 +7,14 @@ import dbc
 from can_bus import codec
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
+from plant_server.chamber import Occlusion
 from plant_server.physiology import load_patient
 from pumpbench.calibration import MODES, SAFE, calibrate
 from pumpbench.conformance.boluses import (
     COMMIT,
     DOSE,
     DRUGS,
+    FIRST,
     INSULIN,
     PRAMLINTIDE,
     PROGRAM_ACKS,
@@ -20,12 +22,20 @@ from pumpbench.conformance.boluses import (
     commands,
     programs,
 )
-from pumpbench.conformance.driver import GLUCOSE, Bench, Op, State, Turn, calibration, expect
+from pumpbench.conformance.driver import (
+    GLUCOSE,
+    HIGH,
+    SUSPEND,
+    Bench,
+    Op,
+    State,
+    Turn,
+    calibration,
+    expect,
+    parameter_index,
+)
 from pumpbench.conformance.loop import Loop, Values, Wire
 from pumpbench.conformance.registry import Dut, Need, NotOffered, check
-
-HIGH: Final = GLUCOSE + 800
-"""A glucose that calls for insulin above the schedule, 0.1 mg/dL."""
 
 RATIO_MODES: Final[tuple[Need, ...]] = ("s2", "s4")
 """Modes in which pramlintide follows the insulin rate."""
@@ -33,13 +43,8 @@ RATIO_MODES: Final[tuple[Need, ...]] = ("s2", "s4")
 BOLUS_MODES: Final[tuple[Need, ...]] = ("s1", "s3", "s4")
 """Modes with boluses of pramlintide: at the peak of the infusion, with the meal, in proportion to insulin's."""
 
-OCCLUDED = codec.choice("PUMP_Status", "InsulinOcclusion", "Occluded")
-
 PRAM_RATE_ACK: Final = 8
 """PUMP_Ack.AckFor of the rate of pramlintide."""
-
-FIRST: Final = 6
-"""Step of the first meal: the device is in Auto by then."""
 
 MEALS: Final = tuple(
     codec.choice("MEAL_Announce", "MealKind", kind) for kind in ("CarbsEstimated", "SimpleMeal", "Snack")
@@ -62,16 +67,11 @@ def ratio_mode(dut: Dut) -> str:
     raise NotOffered("a mode in which pramlintide follows insulin")
 
 
-def pramlintide(turn: Turn) -> int:
-    """The commanded rate of pramlintide, 0.1 ug/h: nothing unless a set-point is sent."""
-    return turn.command["PramlintideRate"] if turn.command["BasalOp"] == Op.SET_RATE else 0
-
-
 def giving(dut: Dut, **how: object) -> Bench:
     """A bench whose device gives both drugs."""
     bench = dut.bench(mode=MODES[ratio_mode(dut)], **how)
     turn = bench.run(12, HIGH)
-    expect(turn.rate > 0 and pramlintide(turn) > 0, f"both drugs at {HIGH / 10:g} mg/dL; {turn.command} came")
+    expect(turn.rate > 0 and turn.pramlintide > 0, f"both drugs at {HIGH / 10:g} mg/dL; {turn.command} came")
     return bench
 
 
@@ -85,7 +85,7 @@ def never_alone(dut: Dut) -> None:
         falling = [bench.step(glucose) for glucose in range(HIGH, 590, -200)] + [bench.step(600 + k) for k in range(3)]
         expect(falling[-1].rate == 0, f"no insulin at 60 mg/dL; {falling[-1].rate} came")
         bench = giving(dut)
-        bench.send("MODE_Cmd", ModeRequest=MODES[mode], ModeCmdSeq=1, SuspendRequest=1)
+        bench.request(1, SUSPEND, MODES[mode])
         suspended = [bench.step(HIGH) for _ in range(3)]
         expect(
             suspended[0].state == State.SUSPENDED, f"Suspended in the step of the request; {suspended[0].state_name}"
@@ -112,7 +112,7 @@ def _expect_together(turn: Turn) -> None:
     command = turn.command
     insulin = command["BasalOp"] == Op.SET_RATE and command["InsulinRate"] > 0
     alone = not insulin and command["BasalOp"] == Op.SET_RATE and command["PramlintideRate"] > 0
-    safe = turn.state in (State.SAFE_BASAL, State.SUSPENDED) and pramlintide(turn) > 0
+    safe = turn.state in (State.SAFE_BASAL, State.SUSPENDED) and turn.pramlintide > 0
     expect(not alone and not safe, f"no pramlintide without insulin, and none in {turn.state_name}; {command} came")
     drugs = [bolus["BolusHormone"] for bolus in turn.all("PUMP_BolusCmd")]
     expect(insulin or PRAMLINTIDE not in drugs, "no bolus of pramlintide while insulin is suspended")
@@ -144,7 +144,7 @@ def _user_suspends(loop: Loop) -> Wire:
     def wire(name: str, _values: Values, frame: Frame) -> Sequence[Frame] | None:
         if name != "SYNC_Step" or loop.plant.step != FIRST:
             return None
-        request = {"ModeRequest": loop.plant.run.mode, "ModeCmdSeq": 1, "SuspendRequest": 1}
+        request = {"ModeRequest": loop.plant.run.mode, "ModeCmdSeq": 1, "SuspendRequest": SUSPEND}
         return [user.frame("MODE_Cmd", **request), frame]
 
     return wire
@@ -162,22 +162,18 @@ def the_ratio(dut: Dut) -> None:
         for limit in (None, 2500):
             flash = calibration() if limit is None else calibration(CfgMaxBasal=limit)
             bench = dut.bench(mode=MODES[mode], flash=flash)
-            ratio = flash[_index("CfgPramRatio")] * float(signal.scale)
+            ratio = flash[parameter_index("CfgPramRatio")] * float(signal.scale)
             for k in range(24):
                 turn = bench.step(GLUCOSE + 40 * min(k, 24 - k))
                 if turn.state != State.AUTO or turn.command["BasalOp"] != Op.SET_RATE:
                     continue
                 wanted = turn.rate * insulin_lsb * ratio / pram_lsb
                 expect(
-                    abs(pramlintide(turn) - wanted) <= 1,
+                    abs(turn.pramlintide - wanted) <= 1,
                     f"{ratio:g} ug/U of raw {turn.rate}, which is raw {wanted:g}, in step {k} of mode {mode};"
-                    f" {pramlintide(turn)} came",
+                    f" {turn.pramlintide} came",
                 )
             expect(turn.state == State.AUTO, f"Auto after 24 good samples; {turn.state_name} came")
-
-
-def _index(name: str) -> int:
-    return next(number for number, fields in codec.message("CFG_Param").pages.items() if fields[0].name == name)
 
 
 @check("TWO-03", needs=["pramlintide"])
@@ -232,16 +228,21 @@ def _announced(loop: Loop, meals: Mapping[int, int]) -> Wire:
 @check("TWO-04", needs=["pramlintide"])
 def faults_of_one_side(dut: Dut) -> None:
     """Each side's line blocked and its reservoir empty, also at a meal: insulin goes on alone, the other not."""
-    bad = (("PramOcclusion", OCCLUDED), ("PramReservoir", 0), ("InsulinOcclusion", OCCLUDED), ("InsulinReservoir", 0))
+    bad = (
+        ("PramOcclusion", Occlusion.OCCLUDED),
+        ("PramReservoir", 0),
+        ("InsulinOcclusion", Occlusion.OCCLUDED),
+        ("InsulinReservoir", 0),
+    )
     for name, value in bad if any(mode in dut.offers for mode in RATIO_MODES) else ():
         bench = giving(dut)
-        turns = [bench.step(HIGH, status=False, also=[_pump_status(bench, **{name: value})]) for _ in range(3)]
+        turns = [bench.step(HIGH, status=False, also=[bench.status(**{name: value})]) for _ in range(3)]
         for turn in turns[1:]:
             if name.startswith("Pram"):
                 rate = turn.command["InsulinRate"] if turn.command["BasalOp"] == Op.SET_RATE else bench.schedule
                 expect(rate > 0, f"insulin goes on with {name}={value}; {turn.command} came")
             else:
-                expect(pramlintide(turn) == 0, f"no pramlintide with {name}={value}; {pramlintide(turn)} came")
+                expect(turn.pramlintide == 0, f"no pramlintide with {name}={value}; {turn.pramlintide} came")
 
     for mode in (name for name in ("s3", "s4") if name in dut.offers):
         for drug in (INSULIN, PRAMLINTIDE):
@@ -254,11 +255,6 @@ def faults_of_one_side(dut: Dut) -> None:
                 f"insulin alone for a meal while the pump gives no pramlintide, and nothing without insulin, in mode "
                 f"{mode}; {given} were committed with {DRUGS[drug]} stopped",
             )
-
-
-def _pump_status(bench: Bench, **fields: int) -> Frame:
-    sound = {"PumpState": 3, "InsulinReservoir": 2000, "PramReservoir": 2000, "PumpBattery": 90}
-    return bench.frame("PUMP_Status", **sound | fields)
 
 
 @check("TWO-05", needs=["pramlintide"])

@@ -6,77 +6,44 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Final
 
-import dbc
 from can_bus import codec
 from can_bus.codec import COUNTER_MODULUS, Check, Receiver
 from can_bus.frame import CAN_EFF_FLAG, CAN_RTR_FLAG, MAX_DATA, Frame
 from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Node, Phase
 from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES
-from pumpbench.conformance.checks.ladder import SUSPEND
-from pumpbench.conformance.checks.sensor import NOBODY, expect_unused, used
-from pumpbench.conformance.driver import GLUCOSE, NMA, SENT_BY_CTRL, Bench, State, Turn, alarm_code, expect
+from pumpbench.conformance.boluses import carbs_mode
+from pumpbench.conformance.driver import (
+    GLUCOSE,
+    HEARD_BY_CTRL,
+    NMA,
+    SENT_BY_CTRL,
+    SUSPEND,
+    Bench,
+    State,
+    Turn,
+    alarm_code,
+    expect,
+)
 from pumpbench.conformance.loop import Values
 from pumpbench.conformance.registry import Dut, check
+from pumpbench.conformance.situations import difference, expect_unused, whole_batch
 
-HEARD: Final = tuple(each for each in dbc.load().messages if "CTRL" in each.receivers and each.name != "UDS_Request")
-"""What CTRL receives; the diagnostics are a protocol of their own."""
+PROTECTED: Final = tuple(each.name for each in HEARD_BY_CTRL if codec.message(each.name).data_ids is not None)
 
-PROTECTED: Final = tuple(each.name for each in HEARD if codec.message(each.name).data_ids is not None)
+CYCLIC: Final = frozenset(each.name for each in HEARD_BY_CTRL if each.send_type in ("Cyclic", "CyclicAndOnChange"))
 
-CYCLIC: Final = frozenset(each.name for each in HEARD if each.send_type in ("Cyclic", "CyclicAndOnChange"))
-
-WATCHED: Final = tuple(each.name for each in HEARD if "MsgTimeoutTime" in each.dbc.attributes)
+WATCHED: Final = tuple(each.name for each in HEARD_BY_CTRL if "MsgTimeoutTime" in each.dbc.attributes)
 """What CTRL has to miss when it does not come."""
 
 EVENTS_PER_STEP: Final = 16
 """Bad frames in a step, of messages that have no window of checks (E2E-03)."""
 
 
-# ---- what several groups need
-
-
-def carbs_mode(dut: Dut) -> str | None:
-    """A mode with boluses for announced carbohydrates, if the device has one."""
-    return next((name for name in ("ma", "s3") if name in dut.offers), None)
-
-
-def idle_boluses(bench: Bench) -> list[Frame]:
-    """PUMP_BolusState of both drugs, neither of which has a bolus."""
-    nothing = {"BolusPhase": 0, "BolusDeliveredRaw": 0, "BolusProgrammedRaw": 0}
-    return [bench.frame("PUMP_BolusState", BolusStateHormone=drug, **nothing) for drug in (1, 2)]
-
-
-def whole_batch(bench: Bench) -> list[Frame]:
-    """What comes in every step and the bench does not send by itself."""
-    toggle = bench.k % 2
-    return [
-        *idle_boluses(bench),
-        bench.frame("HB_PUMP", NmtPump=5, TogglePump=toggle, ResetCausePump=0, BootPump=0),
-        bench.frame("HB_CGM", NmtCgm=5, ToggleCgm=toggle, ResetCauseCgm=0, BootCgm=0),
-    ]
-
-
 def skip_counter(bench: Bench, name: str, frames: int) -> None:
     """As if so many frames of a message had been lost, or repeated if negative."""
     counters = bench.transmitter.counters
     counters[name] = (counters[name] + frames) % COUNTER_MODULUS
-
-
-Said = Sequence[tuple[str, Values]]
-
-
-def difference(before: Said, after: Said) -> str:
-    """The first frame in which two turns differ, in words; empty if they do not."""
-    for (name, old), (other, new) in zip(before, after, strict=False):
-        if name != other:
-            return f"{other} came in place of {name}"
-        changed = [f"{key} {value} in place of {old[key]}" for key, value in new.items() if value != old[key]]
-        if changed:
-            return f"{name} came with {', '.join(changed)}"
-    if len(before) == len(after):
-        return ""
-    return f"{before[len(after)][0]} did not come" if len(before) > len(after) else f"{after[len(before)][0]} came, too"
 
 
 # ---- bad frames
@@ -89,7 +56,7 @@ def _tempting(bench: Bench) -> dict[str, Frame]:
         "SYNC_Step": {"SyncPhase": Phase.STEP, "StepIndex": k + 7, "SimTime": (k + 7) * STEP_SECONDS},
         "PLANT_Info": {"PlantProtocolMajor": 62, "PlantProtocolMinor": 0},
         "PUMP_Alarm": {"PumpAlarmState": 1, "PumpAlarmPriority": 3, "PumpAlarmCode": 5, "PumpAlarmInstance": 1},
-        "CGM_Reading": {"CgmState": 1, "GlucoseConc": 600, "CgmSampleSeq": k % NOBODY, "CgmSampleStep": k % 256},
+        "CGM_Reading": {"CgmState": 1, "GlucoseConc": 600, "CgmSampleSeq": bench.number, "CgmSampleStep": k % 256},
         "CGM_Status": {"CgmFaultBits": 1, "CgmSessionId": 9, "CgmNoise": 200},
         "MEAL_Announce": {"MealKind": 1, "MealId": 7, "CarbsEst": 120, "MealOffset": 0},
         "UI_AlarmAck": {"AlarmAckNode": 1, "AlarmAckAction": 1, "AlarmAckInstance": 0},
@@ -123,7 +90,7 @@ def _expect_no_effect(dut: Dut, bad: Sequence[tuple[str, Spoil]], what: str) -> 
     events = iter([each for each in bad if each[0] not in CYCLIC])
     apart = dut.settings.e2e.window + 1  # bad frames beside good ones must not add up to a message that is not valid
     strategy = carbs_mode(dut)
-    mode = NMA if strategy is None else MODES[strategy]
+    mode = MODES[strategy or "nma"]
     calm = dut.bench(mode=mode)
     expected = [_instant(calm, k) for k in range(_steps(bad, apart))]
     spoiled, before = dut.bench(mode=mode), 0
@@ -208,12 +175,12 @@ def counter_steps(dut: Dut) -> None:
     for step in range(COUNTER_MODULUS):
         before = bench.run(dut.settings.e2e.window + 1)
         skip_counter(bench, "CGM_Reading", step - 1)
-        number = bench.k % NOBODY
+        number = bench.number
         turn = bench.step()
         if 1 <= step <= limit + 1:
-            expect(used(turn) == number, f"a sample {step} ahead by its counter is used; LastCgmSeq {used(turn)} came")
+            expect(turn.used == number, f"a sample {step} ahead by its counter is used; LastCgmSeq {turn.used} came")
         else:
-            expect_unused(bench, turn, used(before), f"a sample {step} ahead by its counter")
+            expect_unused(bench, turn, before.used, f"a sample {step} ahead by its counter")
         lost = turn.diag["LostFrameCount"] - before.diag["LostFrameCount"]
         missing = max(step - 1, 0)
         expect(
@@ -253,29 +220,29 @@ LOST: Final = "lost"
 def _expect_samples_used(dut: Dut, script: Sequence[str], unused: int, latest: int, when: str) -> None:
     """After a disturbance so many good samples are not used; the `latest` one is, counted from 1."""
     bench = dut.bench()
-    last = used(bench.run(12))
+    last = bench.run(12).used
     for kind in script:
         sample = bench.sample()
         bench.step(cgm=[_flipping([30])(sample)] if kind == DAMAGED else [])
     for good in range(1, latest + 1):
-        number = bench.k % NOBODY
+        number = bench.number
         turn = bench.step()
         if good <= unused:
             expect_unused(bench, turn, last, f"good sample {good} {when}")
         elif good == latest:
-            expect(used(turn) == number, f"good sample {good} {when} is used; LastCgmSeq {used(turn)} came")
+            expect(turn.used == number, f"good sample {good} {when} is used; LastCgmSeq {turn.used} came")
 
 
 def _expect_totals_used(dut: Dut, script: Sequence[str], unused: int, latest: int, when: str) -> None:
     """The same with totals, that show 3 U more once they are good again."""
     bench = dut.bench()
-    before = bench.run(12).status["InsulinOnBoard"]
+    before = bench.run(12).iob
     for kind in script:
         totals = bench.delivered()
         bench.step(totals=_flipping([30])(totals) if kind == DAMAGED else False)
     bench.total += 3000 * 12
     for good in range(1, latest + 1):
-        more = bench.step().status["InsulinOnBoard"] - before
+        more = bench.step().iob - before
         what = f"PUMP_Delivered with 3 U more, good frame {good} {when},"
         if good <= unused:
             expect(more < 200, f"{what} is not used; IOB rose by {more}")
@@ -297,7 +264,7 @@ def sixteen_lost(dut: Dut) -> None:
     bench.run(4)
     old = bench.sample()
     bench.step(cgm=[old])
-    last = used(bench.run(COUNTER_MODULUS - 1))
+    last = bench.run(COUNTER_MODULUS - 1).used
     turn = bench.step(cgm=[old])
     expect_unused(bench, turn, last, f"a sample that is {COUNTER_MODULUS} frames old")
 
@@ -348,7 +315,7 @@ def _boluses_begun(dut: Dut, strategy: str, beside: Sequence[Frame] = ()) -> lis
 def malformed_frames(dut: Dut) -> None:
     """Every other length, remote frames and 29-bit ids of all messages that CTRL hears: counted, and no effect."""
     bad: list[tuple[str, Spoil]] = []
-    for each in HEARD:
+    for each in HEARD_BY_CTRL:
         bad += [(each.name, _with_length(size)) for size in range(MAX_DATA + 1) if size != each.length]
         bad += [(each.name, _with_flag(flag)) for flag in (CAN_RTR_FLAG, CAN_EFF_FLAG)]
     _expect_no_effect(dut, bad, "frames of another length or kind")

@@ -9,20 +9,11 @@ from can_bus.lockstep import STEP_SECONDS, Phase
 from plant_server import mechanism
 from plant_server.physiology import load_patient
 from pumpbench.calibration import MODES, SAFE, calibrate
-from pumpbench.conformance.checks.sensor import HIGH, dosing
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, Op, State, Turn, expect
+from pumpbench.conformance.boluses import CANCEL, COMMIT, PROGRAM, bolus_steps, meal_mode
+from pumpbench.conformance.driver import GLUCOSE, HIGH, NMA, PENDING, RESUME, SUSPEND, Bench, State, Turn, expect
 from pumpbench.conformance.loop import Loop, Values
-from pumpbench.conformance.registry import Dut, NotOffered, check
-
-SUSPEND: Final = codec.choice("MODE_Cmd", "SuspendRequest", "Suspend")
-RESUME: Final = codec.choice("MODE_Cmd", "SuspendRequest", "Resume")
-PENDING: Final = codec.choice("CTRL_Alarm", "CtrlAlarmState", "Pending")
-PROGRAM: Final = codec.choice("PUMP_BolusCmd", "BolusOp", "Program")
-COMMIT: Final = codec.choice("PUMP_BolusCmd", "BolusOp", "Commit")
-CANCEL: Final = codec.choice("PUMP_BolusCmd", "BolusOp", "Cancel")
-
-RETURN: Final = 8
-"""Good steps in which a device is back in Auto: two rungs, two samples, and the window of the E2E check (E2E-03)."""
+from pumpbench.conformance.registry import Dut, check
+from pumpbench.conformance.situations import RETURN, damaged, dosing, expect_state, overload
 
 CAUSES: Final[dict[int, frozenset[str]]] = {
     State.INIT: frozenset({"StateChange"}),
@@ -36,56 +27,17 @@ CAUSES: Final[dict[int, frozenset[str]]] = {
 """What may tell why a state is entered or left."""
 
 
-# ---- what the checks of several groups need
-
-
 def steps_beyond(minutes: float) -> int:
     """The first step at which something that happens once per step has been missing for more than so many minutes."""
     return int(minutes * 60) // STEP_SECONDS + 1
 
 
-def commanded(bench: Bench, turn: Turn) -> float:
-    """The insulin rate (0.005 U/h) that the pump runs after this turn: the set-point, none, or its own schedule."""
-    command = turn.command
-    rates = {Op.SET_RATE: float(command["InsulinRate"]), Op.SUSPEND: 0.0, Op.RESUME_SCHEDULE: bench.basal / 5}
-    expect(command["BasalOp"] in rates, f"SetRate, Suspend or ResumeSchedule; BasalOp {command['BasalOp']} came")
-    return rates[Op(command["BasalOp"])]
-
-
-def pramlintide(turn: Turn) -> int:
-    """The pramlintide rate (0.1 ug/h) that the pump runs after this turn: only a set-point has one."""
-    command = turn.command
-    return command["PramlintideRate"] if command["BasalOp"] == Op.SET_RATE else 0
-
-
 def expect_schedule(bench: Bench, turn: Turn, when: str) -> None:
     """Exactly the schedule and no pramlintide; a set-point may be as much lower as its resolution makes it."""
-    rate, drug = commanded(bench, turn), pramlintide(turn)
+    rate, drug = bench.commanded(turn), turn.pramlintide
     what = f"exactly the schedule of {bench.basal / 5:g} {when}"
     expect(bench.basal / 5 - 1 < rate <= bench.basal / 5, f"{what}; {rate:g} came")
     expect(drug == 0, f"no pramlintide {when}; {drug} came")
-
-
-def expect_state(turn: Turn, state: State, when: str) -> None:
-    """The device says it is in this state."""
-    expect(turn.state == state, f"CtrlState {state.name} {when}; {turn.state_name} came")
-
-
-def pending(turn: Turn, code: str) -> bool:
-    """Whether this alarm is told as pending."""
-    return any(alarm["CtrlAlarmState"] == PENDING for alarm in turn.alarms(code))
-
-
-def confirm(bench: Bench, turn: Turn) -> None:
-    """The user confirms whatever is pending."""
-    for alarm in turn.all("CTRL_Alarm"):
-        if alarm["CtrlAlarmState"] == PENDING:
-            bench.send("UI_AlarmAck", AlarmAckNode=1, AlarmAckAction=1, AlarmAckInstance=alarm["CtrlAlarmInstance"])
-
-
-def request(bench: Bench, number: int, suspend: int, mode: int = NMA) -> None:
-    """The user suspends, resumes, or only asks for a mode (`suspend` 0)."""
-    bench.send("MODE_Cmd", ModeRequest=mode, ModeCmdSeq=number, SuspendRequest=suspend)
 
 
 def lose(loop: Loop, names: Collection[str], first: int, last: int) -> None:
@@ -95,16 +47,6 @@ def lose(loop: Loop, names: Collection[str], first: int, last: int) -> None:
         return [] if name in names and first <= loop.plant.step < last else None
 
     loop.to_device = wire
-
-
-def bolus_steps(loop: Loop, *operations: int) -> list[int]:
-    """Steps in which a PUMP_BolusCmd with one of these operations was sent."""
-    return [step for step, values in loop.steps_of("PUMP_BolusCmd") if values["BolusOp"] in operations]
-
-
-def meal_mode(dut: Dut) -> str | None:
-    """A mode in which a meal asks for an insulin bolus, if the device has one."""
-    return next((name for name in ("ma", "sma", "s3", "s4") if name in dut.offers), None)
 
 
 # ---- the checks
@@ -121,14 +63,13 @@ def a_sensor_gone_for_20_minutes(dut: Dut) -> None:
             continue
         when = f"when the newest sample is {age} steps old"
         expect_state(turn, State.DEGRADED, when)
-        rate = commanded(bench, turn)
+        rate = bench.commanded(turn)
         expect(rate <= bench.basal / 5, f"at most the schedule of {bench.basal / 5:g} {when}; {rate:g} came")
-        expect(age > ladder.degraded or pending(turn, "CgmLost"), f"the alarm CgmLost {when}; it did not come")
-    mode = meal_mode(dut)
-    if mode is None:
+        expect(age > ladder.degraded or turn.pending("CgmLost"), f"the alarm CgmLost {when}; it did not come")
+    if "boluses" not in dut.offers:
         return
     gone, meal, back = 20, 20 + ladder.degraded, 20 + ladder.safe - 1
-    loop = dut.loop(mode, meals=[(meal, 60.0)], steps=back + RETURN)
+    loop = dut.loop(meal_mode(dut), meals=[(meal, 60.0)], steps=back + RETURN)
     lose(loop, ["CGM_Reading"], gone, back)
     loop.play()
     dosed = bolus_steps(loop, PROGRAM, COMMIT)
@@ -151,7 +92,7 @@ def a_sensor_gone_for_two_hours(dut: Dut) -> None:
     low = dut.bench(flash=calibrate(load_patient("adult#001"), SAFE))
     for glucose in (*[GLUCOSE, GLUCOSE + 10] * 5, 900, 600, 610, 600):
         turn = low.step(glucose)
-    expect(commanded(low, turn) == 0, f"no insulin at 60 mg/dL; {commanded(low, turn):g} came")
+    expect(low.commanded(turn) == 0, f"no insulin at 60 mg/dL; {low.commanded(turn):g} came")
     _expect_safe_basal(dut, low, 24)
     high = dosing(dut, mode=MODES["s2"] if "s2" in dut.offers else NMA)
     _expect_safe_basal(dut, high, dut.settings.ladder.safe + 2)
@@ -186,7 +127,7 @@ def the_way_back_up(dut: Dut) -> None:
         expect(climbed <= 1, f"one rung per step; {states[-1].name} to {turn.state_name} came")
         expect(climbed <= 0 or good >= ladder.up, f"no rung up before {ladder.up} good samples; {turn.state_name} came")
         states.append(turn.state)
-        rates.append(commanded(bench, turn))
+        rates.append(bench.commanded(turn))
     expect_state(turn, State.AUTO, f"after {RETURN} good samples")
     _expect_nothing_made_up(dut, before.rate, rates)
     _expect_no_nagging(dut, "every second sample is lost", 72, lambda bench, k: bench.step(HIGH, drop=k % 2 == 1))
@@ -200,16 +141,11 @@ def _expect_nothing_made_up(dut: Dut, before: int, rates: Sequence[float]) -> No
     bench.run(12)
     for _ in range(dut.settings.ladder.safe + 1):
         bench.step(cgm=[])
-    fresh = [commanded(bench, bench.step(HIGH)) for _ in rates]
+    fresh = [bench.commanded(bench.step(HIGH)) for _ in rates]
     most = max(before, *fresh) * 1.1
     expect(
         max(rates) <= most, f"no dose to make up for the time without a sensor, at most {most:g}; {max(rates):g} came"
     )
-
-
-def damaged(frame: Frame) -> Frame:
-    """The same frame with a CRC that does not fit."""
-    return frame._replace(data=bytes([frame.data[0] ^ 0x55]) + frame.data[1:])
 
 
 def _ahead(bench: Bench) -> Frame:
@@ -239,7 +175,7 @@ def _expect_no_nagging(dut: Dut, what: str, steps: int, step: Callable[[Bench, i
                 since >= apart, f"alarms of one code {apart} steps apart when {what}; code {code} came after {since}"
             )
             raised[code] = k
-        confirm(bench, turn)
+        bench.confirm(turn)
 
 
 @check("FAL-04")
@@ -252,12 +188,12 @@ def a_silent_pump(dut: Dut) -> None:
     for k in range(1, 13):
         turn = lost.step(status=False, totals=False)
         if k < silent:
-            expect(not pending(turn, "PumpLost"), f"no PumpLost before {silent} steps of silence; it came after {k}")
+            expect(not turn.pending("PumpLost"), f"no PumpLost before {silent} steps of silence; it came after {k}")
         else:
             expect_state(turn, State.DELIVERY_UNCERTAIN, f"{k} steps after the pump's last frame")
-            expect(k > silent or pending(turn, "PumpLost"), f"the alarm PumpLost after {k} steps; it did not come")
+            expect(k > silent or turn.pending("PumpLost"), f"the alarm PumpLost after {k} steps; it did not come")
         # what it may count besides is at most the insulin of the schedule, which it cannot see delivered either way
-        open_, iob = round(lost.basal * k / 12 / 10) + 5, turn.status["InsulinOnBoard"]
+        open_, iob = round(lost.basal * k / 12 / 10) + 5, turn.iob
         expect(
             abs(iob - reference[k - 1]) <= open_,
             f"IOB of the last totals, {reference[k - 1]} within {open_}, {k} steps after them; {iob} came",
@@ -269,13 +205,12 @@ def a_silent_pump(dut: Dut) -> None:
                 expect_state(turn, State.DELIVERY_UNCERTAIN, f"with the {there} alone")
     turn = lost.run(4)
     expect(turn.state != State.DELIVERY_UNCERTAIN, "an end of DeliveryUncertain with status and totals; it stayed")
-    request(lost, 1, SUSPEND)
-    told = [pending(lost.step(status=False, totals=False), "PumpLost") for _ in range(silent + 1)]
+    lost.request(1, SUSPEND)
+    told = [lost.step(status=False, totals=False).pending("PumpLost") for _ in range(silent + 1)]
     expect(any(told), f"the alarm PumpLost after {silent} steps of silence in Suspended, too; it did not come")
-    mode = meal_mode(dut)
-    if mode is None:
+    if "boluses" not in dut.offers:
         return
-    loop = dut.loop(mode, meals=[(24, 60.0)], steps=32 + RETURN)
+    loop = dut.loop(meal_mode(dut), meals=[(24, 60.0)], steps=32 + RETURN)
     lose(loop, ["PUMP_Ack", "PUMP_Status", "PUMP_Delivered", "PUMP_BolusState"], 20, 32)
     loop.play()
     dosed = [step for step in bolus_steps(loop, PROGRAM, COMMIT) if step < 32]
@@ -298,20 +233,19 @@ def the_user_suspends(dut: Dut) -> None:
     """Suspending stops both drugs and a bolus under way in that step, and nothing but resuming ends it."""
     mode = MODES["s2"] if "s2" in dut.offers else NMA
     bench = dosing(dut, mode=mode)
-    request(bench, 1, SUSPEND, mode)
+    bench.request(1, SUSPEND, mode)
     for k in range(18):
         if k == 6:
-            request(bench, 2, 0, mode)
+            bench.request(2, 0, mode)
         turn = bench.step(HIGH)
-        rate, drug = commanded(bench, turn), pramlintide(turn)
+        rate, drug = bench.commanded(turn), turn.pramlintide
         expect_state(turn, State.SUSPENDED, f"{k} steps after the user suspended")
         expect(rate == drug == 0, f"neither drug {k} steps after the user suspended; {rate:g} and {drug} came")
-    request(bench, 3, RESUME, mode)
+    bench.request(3, RESUME, mode)
     turn = bench.step(HIGH)
     expect(turn.state != State.SUSPENDED, "an end of Suspended in the step in which the user resumes; it stayed")
-    meals = meal_mode(dut)
-    if meals is not None:
-        _suspend_within_a_bolus(dut, meals)
+    if "boluses" in dut.offers:
+        _suspend_within_a_bolus(dut, meal_mode(dut))
 
 
 def _suspend_within_a_bolus(dut: Dut, mode: str) -> None:
@@ -352,7 +286,7 @@ def every_change_is_told(dut: Dut) -> None:
     for missing, steps in TOUR:
         if ("user" in missing) != suspended:
             suspended, number = not suspended, number + 1
-            request(bench, number, SUSPEND if suspended else RESUME)
+            bench.request(number, SUSPEND if suspended else RESUME)
         for _ in range(steps):
             there = "pump" not in missing
             turn = bench.step(cgm=[] if "sensor" in missing else None, status=there, totals=there)
@@ -363,24 +297,7 @@ def every_change_is_told(dut: Dut) -> None:
                 f"in step {bench.k - 1}; no such frame came",
             )
             before = turn.state
-            confirm(bench, turn)
-
-
-EXTENDED_SESSION: Final = bytes.fromhex("021003")
-MORE_WORK: Final = bytes.fromhex("073101020100FFFF")
-"""UDS RoutineControl 0201 (docs/diagnostics.md): 65535 units of work more for task 0."""
-
-
-def overload(loop: Loop) -> None:
-    """Make the step that begins now an overrun, by the routine that is there for tests.
-
-    Raises:
-        NotOffered: the device does not have it.
-    """
-    for ask in (EXTENDED_SESSION, MORE_WORK):
-        said = loop.device.receive(Frame(codec.message("UDS_Request").can_id, ask.ljust(8, b"\xcc")))
-        if not any(frame.data[1] == ask[1] + 0x40 for frame in said):
-            raise NotOffered("the UDS routine 0201, which overloads a task")
+            bench.confirm(turn)
 
 
 @check("FAL-07", needs=["uds"])

@@ -7,16 +7,10 @@ from can_bus import codec
 from can_bus.frame import Frame
 from plant_server.mechanism import SLOWED, STROKES_PER_SUBSTEP
 from plant_server.pump import Pump
-from pumpbench.conformance.boluses import COMMIT_ACKS, INSULIN, Forged, flash, meal_mode, programs
-from pumpbench.conformance.driver import GLUCOSE, Bench, Turn, expect
+from pumpbench.conformance.boluses import COMMIT_ACKS, FIRST, INSULIN, Forged, flash, meal_mode, programs
+from pumpbench.conformance.driver import GLUCOSE, HIGH, Bench, Turn, expect
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, Need, check
-
-HIGH: Final = GLUCOSE + 800
-"""A glucose that calls for insulin above the schedule, 0.1 mg/dL."""
-
-FIRST: Final = 6
-"""Step of the first meal: the device is in Auto by then."""
 
 CLOSE: Final = 5
 """0.01 U, a stroke: amounts that differ by no more are the same."""
@@ -24,11 +18,6 @@ CLOSE: Final = 5
 
 MADE_IN_A_STEP: Final = 50
 """0.01 U of a slow motor: a stroke of 0.05 U in every 30 s."""
-
-
-def iob(turn: Turn) -> int:
-    """InsulinOnBoard, 0.01 U."""
-    return turn.status["InsulinOnBoard"]
 
 
 def expect_alike(found: Sequence[int], wanted: Sequence[int], after: str) -> None:
@@ -119,22 +108,22 @@ def totals_not_commands(dut: Dut) -> None:
     bench = dut.bench()
     bench.run(12, HIGH)
     last, *turns = _without_delivery(bench, HIGH)  # the first still tells of the step before
-    expect(iob(last) > 0, f"insulin on board after an hour above the schedule; InsulinOnBoard {iob(last)} came")
+    expect(last.iob > 0, f"insulin on board after an hour above the schedule; InsulinOnBoard {last.iob} came")
     for k, turn in enumerate(turns):
         expect(
-            iob(turn) <= iob(last) + 1,
-            f"InsulinOnBoard not above the {iob(last)} (0.01 U) of the step before while the pump gives nothing; "
-            f"{iob(turn)} came in step {13 + k}",
+            turn.iob <= last.iob + 1,
+            f"InsulinOnBoard not above the {last.iob} (0.01 U) of the step before while the pump gives nothing; "
+            f"{turn.iob} came in step {13 + k}",
         )
         last = turn
     bench = dut.bench()
     bench.run(FIRST)
     for turn in (*_without_delivery(bench, GLUCOSE), *(bench.step() for _ in range(6))):
-        expect(iob(turn) <= CLOSE, f"nothing on board of a schedule that was missed; {iob(turn)} came")
+        expect(turn.iob <= CLOSE, f"nothing on board of a schedule that was missed; {turn.iob} came")
     bench = dut.bench()
     bench.run(FIRST)
     bench.total += 12 * 2000
-    found = iob(bench.step())
+    found = bench.step().iob
     expect(abs(found - 200) <= 20, f"InsulinOnBoard of about 200 (0.01 U) once 2 U came unasked; {found} came")
 
 
@@ -154,13 +143,13 @@ def totals_that_fall(dut: Dut) -> None:
     """
     bench = dut.bench()
     bench.run(12, HIGH)
-    wanted = [iob(bench.step(HIGH)) for _ in range(4)]
+    wanted = [bench.step(HIGH).iob for _ in range(4)]
     usual = _pending(bench)
 
     bench = dut.bench()
     bench.run(12, HIGH)
     fallen = bench.delivered(InsulinTotal=0, PramTotal=0)
-    found = [iob(bench.step(HIGH, totals=fallen)), *(iob(bench.step(HIGH)) for _ in range(3))]
+    found = [bench.step(HIGH, totals=fallen).iob, *(bench.step(HIGH).iob for _ in range(3))]
     expect_alike(found, wanted, "a total that fell without a reset of the pump")
     expect(bool(_pending(bench) - usual), "an alarm for a total that fell without a reset of the pump; none came")
 
@@ -168,8 +157,8 @@ def totals_that_fall(dut: Dut) -> None:
     last = bench.run(11, HIGH)
     bench.boot_count, bench.total, told = 1, 0, bench.total  # the pump resets when it has told its totals
     last = bench.step(HIGH, totals=bench.delivered(PumpBootCount=0, InsulinTotal=told // 12))
-    found = [iob(bench.step(HIGH)) for _ in range(4)]
-    expect(iob(last) > 0, f"insulin on board before the reset of the pump; {iob(last)} came")
+    found = [bench.step(HIGH).iob for _ in range(4)]
+    expect(last.iob > 0, f"insulin on board before the reset of the pump; {last.iob} came")
     expect_alike(found, wanted, "a reset of the pump")
     if "boluses" not in dut.offers:
         return  # it gives none

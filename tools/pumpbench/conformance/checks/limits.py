@@ -16,6 +16,7 @@ from pumpbench.conformance.boluses import (
     COMMIT,
     DOSE,
     DRUGS,
+    FIRST,
     INSULIN,
     PRAMLINTIDE,
     PROGRAM,
@@ -25,14 +26,22 @@ from pumpbench.conformance.boluses import (
     meal_mode,
     programs,
 )
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, Op, Turn, calibration, expect
+from pumpbench.conformance.driver import (
+    GLUCOSE,
+    HIGH,
+    NMA,
+    SUSPEND,
+    Bench,
+    Op,
+    Turn,
+    calibration,
+    expect,
+    parameter_index,
+)
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import MEALTIME, Dut, check
 
 ADULT: Final = "adult#001"
-
-FIRST: Final = 6
-"""Step of the first meal: the device is in Auto by then."""
 
 RATIO: Final = ("s2", "s4")
 """Modes with a pramlintide infusion."""
@@ -59,10 +68,6 @@ def rate_of(turn: Turn, schedule: int) -> int:
     if not found or found[-1]["BasalOp"] == Op.RESUME_SCHEDULE:
         return schedule
     return found[-1]["InsulinRate"] if found[-1]["BasalOp"] == Op.SET_RATE else 0
-
-
-HIGH: Final = GLUCOSE + 800
-"""A glucose that calls for insulin above the schedule while it stays, 0.1 mg/dL."""
 
 
 def climb(k: int) -> int:
@@ -120,7 +125,7 @@ def insulin_on_board(dut: Dut) -> None:
     bench.total += 12 * 5000  # the pump has given 5 U more
     for _ in range(6):
         turn = bench.step(HIGH)
-        rate, iob = rate_of(turn, bench.schedule), turn.status["InsulinOnBoard"]
+        rate, iob = rate_of(turn, bench.schedule), turn.iob
         expect(iob > 300, f"more than 3 U on board after 5 U; InsulinOnBoard {iob} came")
         expect(rate <= bench.schedule, f"at most the schedule with InsulinOnBoard {iob} above its limit; {rate} came")
     if "boluses" not in dut.offers:
@@ -143,7 +148,7 @@ def limits_not_set(dut: Dut) -> None:
             bench = dut.bench(start=False, flash=_without(name))
             bench.call_roll()
             if invalid:
-                wrong = bench.frame("CFG_Param", CfgIndex=_index(name), **{name: 0})
+                wrong = bench.frame("CFG_Param", CfgIndex=parameter_index(name), **{name: 0})
                 bench.give(bench.forge(wrong, **{name: codec.message("CFG_Param").fields[name].mask}))
             bench.configure(bench.flash, NMA)
             for k in range(16):
@@ -164,12 +169,8 @@ def limits_not_set(dut: Dut) -> None:
         expect(not asked, f"no bolus with {name} not set; raw {asked[0].dose if asked else 0} was programmed")
 
 
-def _index(name: str) -> int:
-    return next(number for number, fields in codec.message("CFG_Param").pages.items() if fields[0].name == name)
-
-
 def _without(name: str) -> dict[int, int]:
-    return with_crc({index: raw for index, raw in calibration().items() if index != _index(name)})
+    return with_crc({index: raw for index, raw in calibration().items() if index != parameter_index(name)})
 
 
 @check("LIM-05")
@@ -291,7 +292,7 @@ def rise(dut: Dut) -> None:
     bench = dut.bench(flash=calibration(ADULT, **raws))
     for k in range(12):
         bench.step(climb(k))
-    user = bench.frame("MODE_Cmd", ModeRequest=NMA, ModeCmdSeq=1, SuspendRequest=1)
+    user = bench.frame("MODE_Cmd", ModeRequest=NMA, ModeCmdSeq=1, SuspendRequest=SUSPEND)
     rate = rate_of(bench.step(4000, also=[user]), bench.schedule)
     expect(rate == 0, f"no insulin in the step in which the user suspends; {rate} came")
 

@@ -6,12 +6,12 @@ from typing import Final
 from can_bus import codec
 from can_bus.codec import Field
 from can_bus.frame import Frame
+from can_bus.lockstep import STEPS_PER_DAY
 from pumpbench.calibration import MODES
-from pumpbench.conformance.checks.alarms import instant
-from pumpbench.conformance.checks.e2e import HEARD, carbs_mode, idle_boluses, whole_batch
-from pumpbench.conformance.checks.ladder import commanded
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, Op, Turn, calibration, expect
+from pumpbench.conformance.boluses import carbs_mode
+from pumpbench.conformance.driver import GLUCOSE, HEARD_BY_CTRL, NMA, Bench, Op, Turn, calibration, expect
 from pumpbench.conformance.registry import Dut, check
+from pumpbench.conformance.situations import idle_boluses, whole_batch
 
 RATE_MAX: Final = 8000
 """Raw, of either drug's rate; what is above is reserved."""
@@ -28,7 +28,7 @@ IOB_SNA: Final = 4095
 BOUNDARIES: Final = (199, 200, 255, 256, 1199, 1200, 1270, 1271, RATE_MAX)
 """Raw rates at the ends of bytes, and at 6 and 6.35 U/h, where other pumps have erred."""
 
-SWEPT: Final = tuple(each.name for each in HEARD if each.name not in ("SYNC_Step", "PLANT_Info", "CFG_Param"))
+SWEPT: Final = tuple(each.name for each in HEARD_BY_CTRL if each.name not in ("SYNC_Step", "PLANT_Info", "CFG_Param"))
 """What is heard in a run; time and calibration are other groups' business."""
 
 REGULAR: Final = frozenset(("CGM_Reading", "PUMP_Status", "PUMP_Delivered", "PUMP_BolusState", "HB_PUMP", "HB_CGM"))
@@ -41,7 +41,7 @@ def any_value(dut: Dut) -> None:
     Totals run into their end at 24 bits. The long form takes more values.
     """
     strategy = carbs_mode(dut)
-    mode = NMA if strategy is None else MODES[strategy]
+    mode = MODES[strategy or "nma"]
     limits = {"CfgMaxBasal": calibration()[0] * 5 // 4, "CfgMaxBolus": 300, "CfgMaxIob": 2000}
     rng = random.Random(1)
     for name in SWEPT:
@@ -50,13 +50,13 @@ def any_value(dut: Dut) -> None:
         for together in [[field] for field in fields] if name == "PUMP_Delivered" else [fields]:
             bench = dut.bench(mode=mode, flash=calibration("adult#001", **limits))
             for _ in range(4):
-                instant(bench, *_batch(bench))
+                bench.instant(*_batch(bench))
             for field in together:
                 for raw in _values(field, rng, 40 if dut.long else 3):
-                    turn = instant(bench, *_batch(bench, (name, field.name, raw)))
+                    turn = bench.instant(*_batch(bench, (name, field.name, raw)))
                     _expect_within(turn, limits, f"with {name}.{field.name} {raw}")
                     while turn.all("PUMP_BolusCmd"):  # nobody answers it: it has to expire before the next one
-                        turn = instant(bench, *_batch(bench))
+                        turn = bench.instant(*_batch(bench))
                         _expect_within(turn, limits, f"after {name}.{field.name} {raw}")
     _totals_at_their_end(dut)
 
@@ -119,9 +119,9 @@ def _totals_at_their_end(dut: Dut) -> None:
     for _ in range(12):
         total = bench.total // 12
         totals = bench.delivered(InsulinTotal=total if total <= TOTAL.high else TOTAL_SNA)
-        board.append(bench.step(totals=totals).status["InsulinOnBoard"])
+        board.append(bench.step(totals=totals).iob)
     bench.boot_count, bench.total = 1, bench.basal
-    board += [bench.step().status["InsulinOnBoard"] for _ in range(3)]
+    board += [bench.step().iob for _ in range(3)]
     most = max(board)
     expect(most <= 50, f"no insulin on board at the end of the pump's total and beyond; {most} came")
 
@@ -138,18 +138,18 @@ def the_schedule_as_oracle(dut: Dut) -> None:
         bench = dut.bench(flash=_loose(CfgBasal=5 * raw))
         bench.run(3)
         for _ in range(5):
-            rate = commanded(bench, bench.step())
+            rate = bench.commanded(bench.step())
             expect(abs(rate - raw) <= 1, f"the schedule of {raw} at {GLUCOSE / 10:g} mg/dL, to one LSB; {rate:g} came")
 
 
 @check("NUM-03")
 def what_rounding_leaves(dut: Dut) -> None:
     """A schedule between two raw values for hours, in the long form a day: rounded down, the rest carried on."""
-    steps = 288 if dut.long else 72
+    steps = STEPS_PER_DAY if dut.long else 72
     for basal in (1003, 1001):
         bench = dut.bench(flash=_loose(CfgBasal=basal))
         bench.run(4)
-        rates = [commanded(bench, bench.step()) for _ in range(steps)]
+        rates = [bench.commanded(bench.step()) for _ in range(steps)]
         exact = steps * basal / 5
         expect(max(rates) <= basal // 5 + 1, f"rates of {basal // 5} or one more; {max(rates):g} came")
         expect(
@@ -190,7 +190,7 @@ def extreme_inputs(dut: Dut) -> None:
     for k in range(6):
         turn = bench.step(GLUCOSE - 130 * (k + 1))
         _expect_no_codes(turn)
-    rate = commanded(bench, turn)
+    rate = bench.commanded(turn)
     expect(
         rate == 0, f"no insulin in a fall to {GLUCOSE / 10 - 78:g} mg/dL, where the demand is negative; {rate:g} came"
     )

@@ -7,25 +7,25 @@ from can_bus import codec
 from can_bus.codec import Receiver
 from can_bus.faults.nodes import MemoryState
 from can_bus.frame import Frame
-from can_bus.lockstep import STEP_SECONDS, Node
+from can_bus.lockstep import STEP_SECONDS
 from pumpbench.calibration import MODES
-from pumpbench.conformance.checks.e2e import carbs_mode, idle_boluses
-from pumpbench.conformance.checks.ladder import (
-    COMMIT,
-    PROGRAM,
+from pumpbench.conformance.boluses import ACK_OF, COMMIT, INSULIN, PROGRAM, PowerCut, bolus_steps, carbs_mode
+from pumpbench.conformance.driver import (
+    HIGH,
+    NMA,
     RESUME,
-    RETURN,
+    SENT_BY_CTRL,
     SUSPEND,
-    bolus_steps,
-    commanded,
-    expect_state,
-    pending,
-    request,
+    Bench,
+    State,
+    Turn,
+    calibration,
+    expect,
+    parameter_index,
 )
-from pumpbench.conformance.checks.sensor import HIGH, expect_unused, used
-from pumpbench.conformance.driver import NMA, SENT_BY_CTRL, Bench, State, Turn, calibration, expect
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, NotOffered, check
+from pumpbench.conformance.situations import RETURN, expect_state, expect_unused, idle_boluses
 
 BOOT_COUNTS: Final = 32
 """HB_CTRL.BootCtrl has five bits."""
@@ -34,8 +34,6 @@ BOOT_UP: Final = codec.choice("HB_CTRL", "NmtCtrl", "BootUp")
 CAUSES: Final = tuple(
     codec.choice("HB_CTRL", "ResetCauseCtrl", cause) for cause in ("PowerOn", "BrownOut", "Watchdog", "Software", "Pin")
 )
-INSULIN_COMMIT: Final = codec.choice("PUMP_Ack", "AckFor", "InsulinBolusCommit")
-INSULIN_PROGRAM: Final = codec.choice("PUMP_Ack", "AckFor", "InsulinBolusProgram")
 
 SLACK: Final = 10
 """0.01 U: what the schedule of a step or two, which another device may count otherwise, makes of insulin on board."""
@@ -61,30 +59,6 @@ def with_insulin(dut: Dut, **how: object) -> Bench:
 
 
 # ---- power cuts within a meal
-
-
-class PowerCut:
-    """A device whose power fails instead of its hearing one certain frame.
-
-    Args:
-        dut: cuts the power.
-        device: the device.
-        when: whether this frame is the one; asked until it is.
-    """
-
-    finished = False
-
-    def __init__(self, dut: Dut, device: Node, when: Callable[[str, Values], bool]) -> None:
-        self._dut, self._device, self._when = dut, device, when
-        self.done = False
-
-    def receive(self, frame: Frame) -> Sequence[Frame]:
-        """What the device says, or says by itself once it has power again."""
-        message = codec.messages_by_id().get(frame.can_id)
-        if not self.done and message is not None and self._when(message.name, message.unpack(frame.data)):
-            self.done = True
-            return self._dut.restart()
-        return self._device.receive(frame)
 
 
 def _meal(dut: Dut, when: Callable[[str, Values], bool] = lambda *_: False) -> Loop:
@@ -142,7 +116,7 @@ def power_cuts(dut: Dut) -> None:
     before = bench.step()
     restarted(dut, bench)
     turn = bench.step(cgm=[sample])
-    expect_unused(bench, turn, used(before), "a sample that was used before the power was cut")
+    expect_unused(bench, turn, before.used, "a sample that was used before the power was cut")
     _expect_kept(before, turn)
     for heard in (1, 2, 3):  # of sample, status and totals
         before = bench.step()
@@ -171,7 +145,7 @@ def _expect_kept(before: Turn, turn: Turn) -> None:
     for name in ("CtrlMode", "LastMealId"):
         was, now = before.status[name], turn.status[name]
         expect(now == was, f"{name} {was} as before the power was cut; {now} came")
-    was, now = before.status["InsulinOnBoard"], turn.status["InsulinOnBoard"]
+    was, now = before.status["InsulinOnBoard"], turn.iob
     least = was * 0.95 - SLACK
     expect(now >= least, f"at least {least:.0f} of insulin on board, {was} before the power was cut; {now} came")
     number, next_number = before.command["BasalCmdSeq"], turn.command["BasalCmdSeq"]
@@ -190,7 +164,7 @@ def _limits_are_kept(dut: Dut) -> None:
     restarted(dut, bench)
     for _ in range(RETURN):
         turn = bench.step(HIGH)
-        rate = commanded(bench, turn)
+        rate = bench.commanded(turn)
         expect(rate <= cap / 5, f"at most CfgMaxBasal, {cap / 5:g}, after a restart; {rate:g} came")
     expect(rate > bench.basal / 5, f"more than the schedule {RETURN} steps after a restart; {rate:g} came")
 
@@ -200,11 +174,11 @@ def _suspension_and_alarms_are_kept(dut: Dut) -> None:
     bench.run(4)
     for _ in range(dut.settings.ladder.degraded + 1):
         turn = bench.step(drop=True)
-    expect(pending(turn, "CgmLost"), "the alarm CgmLost without samples")
+    expect(turn.pending("CgmLost"), "the alarm CgmLost without samples")
     restarted(dut, bench)
     turn = bench.step(drop=True)
-    expect(pending(turn, "CgmLost"), "the alarm CgmLost also after a restart")
-    request(bench, 1, SUSPEND)
+    expect(turn.pending("CgmLost"), "the alarm CgmLost also after a restart")
+    bench.request(1, SUSPEND)
     bench.step()
     restarted(dut, bench)
     expect_state(bench.step(), State.SUSPENDED, "after a restart, as the user has it")
@@ -217,7 +191,7 @@ def a_damaged_memory(dut: Dut) -> None:
     A device that then still knows a calibration must count CfgMaxIob and tell of it with the alarm SelfTest.
     """
     strategy = carbs_mode(dut)
-    bench = with_insulin(dut, mode=NMA if strategy is None else MODES[strategy])
+    bench = with_insulin(dut, mode=MODES[strategy or "nma"])
     before = bench.step()
     restarted(dut, bench, "torn")
     turn = bench.step()
@@ -233,19 +207,18 @@ def a_damaged_memory(dut: Dut) -> None:
         turn = _announced(bench, k)
         begun = turn.all("PUMP_BolusCmd")
         expect(not begun, f"no bolus by a device that has lost its memory; {begun[:1]} came")
-        rate = commanded(bench, turn) if turn.all("PUMP_BasalCmd") else 0.0
+        rate = bench.commanded(turn) if turn.all("PUMP_BasalCmd") else 0.0
         expect(
             rate <= bench.basal / 5,
             f"at most the schedule of {bench.basal / 5:g} by a device that has lost its memory; {rate:g} came",
         )
         if turn.state not in (State.INIT, State.FAULT):
-            iob = turn.status["InsulinOnBoard"]
-            expect(iob >= bench.flash[MAX_IOB], f"CfgMaxIob on board by a device that knows of none; {iob} came")
+            iob = turn.iob
+            expect(
+                iob >= bench.flash[parameter_index("CfgMaxIob")],
+                f"CfgMaxIob on board by a device that knows of none; {iob} came",
+            )
             expect(bool(bench.raised("SelfTest")), "the alarm SelfTest by a device that has lost its memory")
-
-
-MAX_IOB: Final = 5
-"""CfgIndex of CfgMaxIob."""
 
 
 @check("RST-03", needs=["restart", "nvm", "boluses"])
@@ -271,7 +244,7 @@ def boluses_after_a_restart(dut: Dut) -> None:
                 break
         expect(bool(begun), f"a bolus for a meal within {RETURN} steps after {held} was heard again")
     calm = _meal(dut)
-    loop = _meal(dut, lambda name, values: name == "PUMP_Ack" and values["AckFor"] == INSULIN_COMMIT)
+    loop = _meal(dut, lambda name, values: name == "PUMP_Ack" and values["AckFor"] == ACK_OF[INSULIN, COMMIT])
     _expect_safe(loop, calm, "with a restart between Commit and acknowledgement")
 
 
@@ -303,7 +276,7 @@ def resets_are_told(dut: Dut) -> None:
                 expect_state(turn, State.SAFE_BASAL, f"{k} steps after {number} resets within an hour")
         if not held:
             expect_state(turn, State.AUTO, f"{HELD_STEPS} steps after {number} resets within an hour")
-    request(bench, 1, RESUME)
+    bench.request(1, RESUME)
     expect_state(bench.run(RETURN), State.AUTO, f"{RETURN} steps after the user has resumed")
 
 
@@ -323,7 +296,7 @@ def a_reset_of_the_pump(dut: Dut) -> None:
     loop = dut.loop(strategy, [(MEAL, 60.0), (MEAL + 6, 40.0)], MEAL + 10)
 
     def wire(name: str, values: Values, _frame: Frame) -> Sequence[Frame] | None:
-        if name != "PUMP_Ack" or values["AckFor"] != INSULIN_PROGRAM or loop.plant.step != MEAL:
+        if name != "PUMP_Ack" or values["AckFor"] != ACK_OF[INSULIN, PROGRAM] or loop.plant.step != MEAL:
             return None
         if loop.plant.pump.boots == 0:
             loop.plant.pump.reset()

@@ -9,6 +9,7 @@ from can_bus.codec import Check, Receiver
 from can_bus.faults import Fault as WireFault
 from can_bus.frame import CAN_RTR_FLAG, Frame
 from can_bus.gateway import Gateway, Side
+from can_bus.lockstep import STEPS_PER_DAY
 from pumpbench import catalogue
 from pumpbench.conformance.driver import GLUCOSE, State, expect
 from pumpbench.conformance.loop import Values, Wire
@@ -119,7 +120,7 @@ def _through(gateway: Gateway) -> Wire:
 def twice_the_same(dut: Dut) -> None:
     """The same run twice, a day or in the long form a fortnight: the device says the same, byte by byte."""
     strategy = "s3" if "s3" in dut.offers else "nma"
-    steps = 14 * 288 if dut.long else 96
+    steps = 14 * STEPS_PER_DAY if dut.long else 96
     said: list[list[tuple[int, str, Values]]] = []
     for _ in range(2):
         loop = dut.loop(strategy, [(20, 60.0), (70, 40.0)], steps)

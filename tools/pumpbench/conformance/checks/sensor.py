@@ -14,40 +14,15 @@ from plant_server.sensors.effects import Bias, Lag
 from plant_server.sensors.ideal import Ideal
 from plant_server.sensors.vettoretti2019 import Vettoretti2019
 from pumpbench.calibration import SAFE, calibrate
-from pumpbench.conformance.driver import GLUCOSE, Bench, State, Turn, calibration, expect
+from pumpbench.conformance.driver import GLUCOSE, HIGH, calibration, expect
 from pumpbench.conformance.registry import Dut, check
+from pumpbench.conformance.situations import dosing, expect_unused
 from pumpbench.hazards import Monitor
-
-HIGH: Final = GLUCOSE + 800
-"""A glucose that calls for insulin above the schedule, 0.1 mg/dL."""
 
 OK = codec.choice("CGM_Reading", "CgmState", "Ok")
 BELOW = codec.choice("CGM_Reading", "CgmState", "BelowRange")
 ABOVE = codec.choice("CGM_Reading", "CgmState", "AboveRange")
 STALE_BIT: Final = 1 << 4
-NOBODY: Final = 65535
-"""LastCgmSeq of a device that has used no sample."""
-
-
-def dosing(dut: Dut, steps: int = 12, glucose: int = HIGH, **how: object) -> Bench:
-    """A bench whose device gives insulin above the schedule, on account of a high glucose."""
-    bench = dut.bench(**how)
-    turn = bench.run(steps, glucose)
-    expect(turn.state == State.AUTO, f"Auto after {steps} good samples; {turn.state_name} came")
-    expect(turn.rate > bench.schedule, f"more than the schedule at {glucose / 10:g} mg/dL; {turn.rate} came")
-    return bench
-
-
-def used(turn: Turn) -> int:
-    """CgmSampleSeq of the newest sample the device says it has used."""
-    return turn.status["LastCgmSeq"]
-
-
-def expect_unused(bench: Bench, turn: Turn, before: int, what: str) -> None:
-    """The sample of this turn must not have been used."""
-    expect(
-        used(turn) == before, f"{what} is not used in step {bench.k - 1}; LastCgmSeq went from {before} to {used(turn)}"
-    )
 
 
 @check("SEN-01")
@@ -75,7 +50,7 @@ def samples_of_the_future(dut: Dut) -> None:
     """A good frame whose CgmSampleStep is ahead by 1, 5 and 128 steps; then an alarm names the sensor."""
     for ahead in (1, 5, 128):
         bench = dosing(dut)
-        before = used(bench.step(HIGH))
+        before = bench.step(HIGH).used
         turn = bench.step(cgm=[bench.sample(HIGH, CgmSampleStep=(bench.k + ahead) % 256)])
         expect_unused(bench, turn, before, f"a sample dated {ahead} steps ahead")
         expect(bool(turn.alarms("CgmImplausible")), f"the alarm CgmImplausible for a sample dated {ahead} steps ahead")
@@ -86,7 +61,7 @@ def old_sequence_numbers(dut: Dut) -> None:
     """A frame that looks fresh (counter, CRC, CgmSampleStep) but has a CgmSampleSeq that was there already."""
     for behind in (0, 1, 10):
         bench = dosing(dut)
-        before = used(bench.step(HIGH))
+        before = bench.step(HIGH).used
         turn = bench.step(cgm=[bench.sample(HIGH, CgmSampleSeq=before - behind)])
         expect_unused(bench, turn, before, f"a sample whose CgmSampleSeq is {behind} behind the newest one")
 
@@ -97,22 +72,22 @@ def states_and_values(dut: Dut) -> None:
     sensor = dut.settings.sensor
     bench = dosing(dut)
     for state in range(16):
-        before = used(bench.step(HIGH))
+        before = bench.step(HIGH).used
         turn = bench.step(cgm=[bench.forge(bench.sample(HIGH), CgmState=state)])
         if state not in (OK, BELOW, ABOVE):
             expect_unused(bench, turn, before, f"a sample with CgmState {state}")
         bench.run(3, HIGH)
     for glucose in (0, 1, sensor.low * 10 - 1, 8001, 8100, 8189, 8190, 8191):
         bench.run(2, HIGH)
-        before = used(bench.step(HIGH))
+        before = bench.step(HIGH).used
         for _ in range(2):  # the second agrees with the first: it is not the jump that is refused
             turn = bench.step(cgm=[bench.forge(bench.sample(), GlucoseConc=glucose)])
             expect_unused(bench, turn, before, f"a sample of raw {glucose}")
     for glucose in (sensor.low * 10, 390):
         bench.run(4, GLUCOSE)
-        number = bench.k % NOBODY
+        number = bench.number
         turn = bench.step(glucose)
-        expect(used(turn) == number, f"a sample of {glucose / 10:g} mg/dL is used; LastCgmSeq {used(turn)} came")
+        expect(turn.used == number, f"a sample of {glucose / 10:g} mg/dL is used; LastCgmSeq {turn.used} came")
 
 
 @check("SEN-05")
@@ -146,14 +121,14 @@ def a_jump(dut: Dut) -> None:
     before = bench.step().rate
     turn = bench.step(GLUCOSE + 1800)
     expect(turn.rate <= before, f"no more than {before} after a single jump; {turn.rate} came")
-    number = bench.k % NOBODY
+    number = bench.number
     turn = bench.step(GLUCOSE + 1810)
-    expect(used(turn) == number, f"the second sample after a jump agrees and is used; LastCgmSeq {used(turn)} came")
+    expect(turn.used == number, f"the second sample after a jump agrees and is used; LastCgmSeq {turn.used} came")
     bench = dut.bench()
     bench.run(12)
-    number = bench.k % NOBODY
+    number = bench.number
     turn = bench.step(GLUCOSE - 600)
-    expect(used(turn) == number, "a sample that falls by 60 mg/dL is used at once: it can only withhold")
+    expect(turn.used == number, "a sample that falls by 60 mg/dL is used at once: it can only withhold")
 
 
 @check("SEN-07")
@@ -165,10 +140,10 @@ def a_stuck_sensor(dut: Dut) -> None:
         bench.step(HIGH + k % 2 * 10)
     last = 0
     for repeated in range(1, limit + 4):
-        number = bench.k % NOBODY
+        number = bench.number
         turn = bench.step(HIGH + 50)
         if repeated < limit:
-            expect(used(turn) == number, f"{repeated} equal samples are used, {limit} are a stuck sensor")
+            expect(turn.used == number, f"{repeated} equal samples are used, {limit} are a stuck sensor")
             last = number
         else:
             expect_unused(bench, turn, last, f"sample {repeated} of the same value")

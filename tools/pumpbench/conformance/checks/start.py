@@ -3,11 +3,9 @@
 from collections.abc import Callable
 from typing import Final
 
-from can_bus import codec
 from pumpbench.calibration import with_crc
-from pumpbench.conformance.checks.ladder import COMMIT, PROGRAM, bolus_steps, commanded, meal_mode
-from pumpbench.conformance.checks.sensor import HIGH
-from pumpbench.conformance.driver import Bench, Turn, calibration, expect
+from pumpbench.conformance.boluses import COMMIT, PROGRAM, bolus_steps, meal_mode
+from pumpbench.conformance.driver import HIGH, Bench, Turn, calibration, expect, parameter_names
 from pumpbench.conformance.registry import Dut, check
 
 TEN: Final = range(10)
@@ -21,14 +19,13 @@ STEPS: Final = 8
 def one_thing_missing(dut: Dut) -> None:
     """What a start needs is held back, one thing at a time, with a high glucose: at most the schedule, and no bolus."""
     complete = dut.bench()
-    rate = commanded(complete, complete.run(STEPS, HIGH))
+    rate = complete.commanded(complete.run(STEPS, HIGH))
     expect(
         rate > complete.schedule, f"more than the schedule of {complete.schedule} with nothing missing; {rate:g} came"
     )
-    names = {index: fields[0].name for index, fields in codec.message("CFG_Param").pages.items()}
     for index in TEN:
         flash = {number: raw for number, raw in calibration().items() if number != index}
-        _expect_at_most_schedule(dut.bench(flash=with_crc(flash)), f"without {names[index]}")
+        _expect_at_most_schedule(dut.bench(flash=with_crc(flash)), f"without {parameter_names()[index]}")
     _expect_at_most_schedule(dut.bench(flash=calibration(CfgCarbRatio=0)), "with a CfgCarbRatio of 0")
     _expect_at_most_schedule(dut.bench(), "without PUMP_Status", lambda bench: bench.step(HIGH, status=False))
     _expect_at_most_schedule(dut.bench(), "without PUMP_Delivered", lambda bench: bench.step(HIGH, totals=False))
@@ -36,9 +33,8 @@ def one_thing_missing(dut: Dut) -> None:
     _expect_at_most_schedule(
         dut.bench(), f"after {few} samples", lambda bench: bench.step(HIGH, cgm=None if bench.k < few else [])
     )
-    mode = meal_mode(dut)
-    if mode is not None:
-        loop = dut.loop(mode, meals=[(6, 60.0)], steps=10)
+    if "boluses" in dut.offers:
+        loop = dut.loop(meal_mode(dut), meals=[(6, 60.0)], steps=10)
         loop.to_device = lambda name, _values, _frame: [] if name == "PUMP_BolusState" else None
         loop.play()
         begun = bolus_steps(loop, PROGRAM, COMMIT)
@@ -51,5 +47,5 @@ def _expect_at_most_schedule(
     schedule = calibration()[0] / 5  # of the patient, where the device knows none
     for _ in range(STEPS):
         turn = step(bench)
-        rate = commanded(bench, turn) if turn.all("PUMP_BasalCmd") else 0.0
+        rate = bench.commanded(turn) if turn.all("PUMP_BasalCmd") else 0.0
         expect(rate <= schedule, f"at most the schedule of {schedule:g} {what}; {rate:g} came in step {bench.k - 1}")

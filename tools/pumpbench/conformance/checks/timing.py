@@ -10,13 +10,11 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Node, Phase
 from plant_server import mechanism
 from pumpbench.calibration import MODES
-from pumpbench.conformance.checks.alarms import instant
-from pumpbench.conformance.checks.e2e import carbs_mode, difference, idle_boluses
-from pumpbench.conformance.checks.ladder import commanded
-from pumpbench.conformance.checks.sensor import HIGH, NOBODY, expect_unused, used
-from pumpbench.conformance.driver import GLUCOSE, NMA, Bench, State, Turn, expect
+from pumpbench.conformance.boluses import carbs_mode
+from pumpbench.conformance.driver import GLUCOSE, HIGH, Bench, State, Turn, expect
 from pumpbench.conformance.loop import Loop
 from pumpbench.conformance.registry import Dut, check
+from pumpbench.conformance.situations import difference, expect_unused, idle_boluses
 
 LAST_STEP: Final = 1048574
 """The largest StepIndex, after 9.9 years."""
@@ -46,7 +44,7 @@ def repeated_steps(dut: Dut) -> None:
     mode = carbs_mode(dut)
     last: list[Turn] = []
     for repeated in (False, True):
-        bench = dut.bench(mode=NMA if mode is None else MODES[mode])
+        bench = dut.bench(mode=MODES[mode or "nma"])
         for _ in range(12):
             bench.step(HIGH, also=idle_boluses(bench))
         if repeated:
@@ -77,7 +75,7 @@ def skipped_steps(dut: Dut) -> None:
     ladder = dut.settings.ladder
     for skipped, state in ((ladder.degraded, State.DEGRADED), (ladder.safe, State.SAFE_BASAL)):
         bench = dut.bench()
-        last = used(bench.run(12, HIGH))
+        last = bench.run(12, HIGH).used
         late = bench.sample(HIGH)
         bench.total += bench.basal * (skipped - 1)
         bench.k += skipped - 1
@@ -85,7 +83,7 @@ def skipped_steps(dut: Dut) -> None:
         expect(turn.state == state, f"{state.name} after a jump by {skipped} steps; {turn.state_name} came")
         expect_unused(bench, turn, last, f"a sample of {skipped - 1} steps ago")
         expect_command_of(bench, turn, dut.settings.commands.rate_expiry)
-        rate = commanded(bench, turn)
+        rate = bench.commanded(turn)
         expect(rate <= bench.basal / 5, f"at most the schedule of {bench.basal / 5:g} after the jump; {rate:g} came")
     iob = [_iob_after(dut, jump) for jump in (False, True)]
     expect(
@@ -110,7 +108,7 @@ def _iob_after(dut: Dut, jump: bool) -> int:
             turn = bench.step(drop=True)
         else:
             bench.k += 1
-    return turn.status["InsulinOnBoard"]
+    return turn.iob
 
 
 @check("TIM-03")
@@ -125,15 +123,15 @@ def clock_jumps(dut: Dut) -> None:
         bench.k = 100
         turn = bench.run(8, HIGH)
         expect(turn.rate > bench.schedule, f"more than the schedule at {HIGH / 10:g} mg/dL; {turn.rate} came")
-        number = bench.k % NOBODY
-        turn = instant(bench, bench.sample(HIGH), bench.status(), bench.delivered(), off=off)
+        number = bench.number
+        turn = bench.instant(bench.sample(HIGH), bench.status(), bench.delivered(), off=off)
         status = {name: turn.status[name] for name in ("CtrlState", "InsulinOnBoard", "LastCgmSeq")}
         if off == 0:
             calm = status
-        expect(used(turn) == number and status == calm, f"{calm} with a clock {off} s off; {status} came")
+        expect(turn.used == number and status == calm, f"{calm} with a clock {off} s off; {status} came")
         told = bool(turn.alarms("ClockJump"))
         expect(told == (abs(off) > clock), f"ClockJump with more than {clock} s; with {off} s it was {told}")
-        rates = [commanded(bench, turn), *(commanded(bench, bench.step(HIGH)) for _ in range(caution + 2))]
+        rates = [bench.commanded(turn), *(bench.commanded(bench.step(HIGH)) for _ in range(caution + 2))]
         if told:
             paused = max(rates[:caution])
             expect(
@@ -193,7 +191,7 @@ def numbers_that_wrap(dut: Dut) -> None:
     degraded = dut.settings.ladder.degraded
     bench = dut.bench()
     bench.k = 250
-    last = used(bench.run(4))
+    last = bench.run(4).used
     for age in range(1, degraded + 2):
         old = bench.sample(CgmSampleStep=(bench.k - 9) % 256)
         turn = bench.step(cgm=[old] if age > degraded else [])
@@ -237,10 +235,10 @@ def the_order_of_a_turn(dut: Dut) -> None:
 
 
 def _expect_nothing_stale(dut: Dut, bench: Bench, when: str) -> None:
-    number = bench.k % NOBODY
+    number = bench.number
     turn = bench.step()
     expect_command_of(bench, turn, dut.settings.commands.rate_expiry)
-    expect(used(turn) == number, f"the newest sample is used {when}; LastCgmSeq {used(turn)} came, not {number}")
+    expect(turn.used == number, f"the newest sample is used {when}; LastCgmSeq {turn.used} came, not {number}")
 
 
 class _InTurn:

@@ -7,19 +7,26 @@ from can_bus import codec
 from can_bus.frame import Frame
 from can_bus.lockstep import Phase
 from pumpbench.calibration import MODES, with_crc
-from pumpbench.conformance.checks.e2e import carbs_mode, idle_boluses
-from pumpbench.conformance.checks.ladder import COMMIT, PROGRAM, SUSPEND, commanded, meal_mode
-from pumpbench.conformance.checks.reset import PowerCut
-from pumpbench.conformance.checks.sensor import HIGH
-from pumpbench.conformance.driver import NMA, Bench, State, Turn, calibration, expect
+from pumpbench.conformance.boluses import ACK_OF, COMMIT, INSULIN, PROGRAM, PowerCut, carbs_mode, meal_mode
+from pumpbench.conformance.driver import (
+    HIGH,
+    NMA,
+    SUSPEND,
+    Bench,
+    State,
+    Turn,
+    calibration,
+    expect,
+    parameter_names,
+)
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, NotOffered, check
+from pumpbench.conformance.situations import idle_boluses
 
 CARBS_ESTIMATED: Final = codec.choice("MEAL_Announce", "MealKind", "CarbsEstimated")
 HYPO_TREATMENT: Final = codec.choice("MEAL_Announce", "MealKind", "HypoTreatment")
 CANCEL: Final = codec.choice("MEAL_Announce", "MealKind", "Cancel")
 PROGRAMMED: Final = codec.choice("PUMP_BolusState", "BolusPhase", "Programmed")
-INSULIN_PROGRAM: Final = codec.choice("PUMP_Ack", "AckFor", "InsulinBolusProgram")
 
 MODE_CODES: Final = 16
 MODES_KNOWN: Final = frozenset(range(9))
@@ -69,11 +76,8 @@ def a_meal_acts_once(dut: Dut) -> None:
 
     Also over a restart, where the device can be restarted and has a memory.
     """
-    strategy = meal_mode(dut)
-    if strategy is None:
-        raise NotOffered("a mode with boluses for announced meals")
     for restart in (False, True) if {"restart", "nvm"} <= dut.offers else (False,):
-        loop = _nagged(dut, strategy, restart)
+        loop = _nagged(dut, restart)
         doses = loop.commits(1)
         what = "with a restart between" if restart else "however often it is told"
         expect(len(doses) == 1, f"one insulin bolus for one meal {what}; {doses} were committed")
@@ -84,9 +88,9 @@ def a_meal_acts_once(dut: Dut) -> None:
 MEAL: Final = 10
 
 
-def _nagged(dut: Dut, strategy: str, restart: bool) -> Loop:
+def _nagged(dut: Dut, restart: bool) -> Loop:
     """A run in which the user never sees that a meal was heard."""
-    loop = dut.loop(strategy, [(MEAL, 60.0)], MEAL + 12)
+    loop = dut.loop(meal_mode(dut), [(MEAL, 60.0)], MEAL + 12)
     counters = codec.Transmitter()
 
     def thrice(name: str, values: Values, _frame: Frame) -> Sequence[Frame] | None:
@@ -148,7 +152,7 @@ def no_meals(dut: Dut) -> None:
         state = _programmed(bench, begun[0])
         late = bench.frame(
             "PUMP_Ack",
-            AckFor=INSULIN_PROGRAM,
+            AckFor=ACK_OF[INSULIN, PROGRAM],
             AckResult=0,
             AckId=begun[0]["BolusId"],
             AckEchoRaw=begun[0]["InsulinBolus"],
@@ -194,7 +198,7 @@ def modes(dut: Dut) -> None:
         allowed = {before, code} if code in MODES_KNOWN else {before}
         found = turn.status["CtrlMode"]
         expect(found in allowed, f"CtrlMode {sorted(allowed)} after ModeRequest {code}; {found} came")
-        rate = commanded(bench, turn)
+        rate = bench.commanded(turn)
         expect(rate <= bench.basal / 5 + 1, f"at most the schedule at the target, ModeRequest {code}; {rate:g} came")
     bench = dut.bench()
     bench.run(4)
@@ -244,11 +248,10 @@ def parameters(dut: Dut) -> None:
     _flash(bench, SET_CRC, good[SET_CRC])
     *echoes, wrong_set, right_set = _configured(bench)
     expect(len(echoes) == len(expected), f"an echo for each CFG_Param, {len(expected)}; {len(echoes)} came")
-    names = {index: fields[0].name for index, fields in codec.message("CFG_Param").pages.items()}
     for found, (index, raw, crc) in zip(echoes, expected, strict=True):
         expect(
             found == {"EchoIndex": index, "EchoRaw": raw, "EchoSetCrc": crc},
-            f"the echo of {names[index]} as stored, {raw} in a set with CRC {crc}; {found} came",
+            f"the echo of {parameter_names()[index]} as stored, {raw} in a set with CRC {crc}; {found} came",
         )
     crc = good[SET_CRC]
     expect(wrong_set["EchoRaw"] != crc ^ 1, "no set active under a CRC that is not its own")
@@ -259,7 +262,7 @@ def parameters(dut: Dut) -> None:
 
 def _flash(bench: Bench, index: int, raw: int) -> None:
     """A CFG_Param with any value."""
-    name = codec.message("CFG_Param").pages[index][0].name
+    name = parameter_names()[index]
     bench.give(bench.forge(bench.frame("CFG_Param", CfgIndex=index, **{name: 0}), **{name: raw}))
 
 
@@ -275,7 +278,7 @@ def _expect_stale(dut: Dut, minutes: int, age: int) -> None:
     expect(turn.rate > bench.schedule, f"more than the schedule at {HIGH / 10:g} mg/dL; {turn.rate} came")
     for _ in range(age):
         turn = bench.step(drop=True)
-    rate = commanded(bench, turn)
+    rate = bench.commanded(turn)
     expect(
         rate <= bench.basal / 5,
         f"at most the schedule of {bench.basal / 5:g} {age} steps after the newest sample with a CfgStaleCgmLimit "
