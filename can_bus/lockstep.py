@@ -22,7 +22,10 @@ from can_bus.codec import Transmitter
 from can_bus.frame import Frame
 
 STEP_SECONDS = 300
+STEP_MINUTES = STEP_SECONDS // 60
 STEPS_PER_DAY = 86400 // STEP_SECONDS
+"""Of simulated time, from one sampling instant to the next."""
+
 EXEC_TIME_SNA = 65535
 EXEC_TIME_MAX = 65533
 """Of SYNC_Done, raw; 65534 is a code without a name."""

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from can_bus import yaml_file
+from can_bus.lockstep import STEPS_PER_DAY
 
 from .scenarios.announcements import (
     Announcement,
@@ -21,7 +22,7 @@ from .scenarios.announcements import (
 )
 from .scenarios.announcing import Announcing
 from .scenarios.camerlingo import camerlingo
-from .scenarios.meals import MINUTES_PER_DAY, RESCUE, SAMPLE_MINUTES, STEPS_PER_DAY, Meal, Scenario, planned
+from .scenarios.meals import MINUTES_PER_DAY, RESCUE, Meal, Scenario, planned
 from .scenarios.misestimation import Kawamura
 from .scenarios.rescue import RESCUE_EATING_MINUTES, Rescue, Rescuer
 from .scenarios.tuning import tuning
@@ -31,8 +32,6 @@ __all__ = [
     "MINUTES_PER_DAY",
     "RESCUE",
     "RESCUE_EATING_MINUTES",
-    "SAMPLE_MINUTES",
-    "STEPS_PER_DAY",
     "Announcement",
     "Announcing",
     "Kind",

@@ -14,8 +14,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from can_bus import yaml_file
+from can_bus.lockstep import STEP_MINUTES, STEPS_PER_DAY
 
-from .sensors import INSTANTS_PER_DAY, MODELS, SAMPLE_MINUTES, AnyModel, Wear
+from .sensors import MODELS, AnyModel, Wear
 from .sensors.coloured import Coloured
 from .sensors.effects import (
     EFFECTS,
@@ -79,8 +80,8 @@ class Status(NamedTuple):
 
 
 def _multiple(minutes: int) -> int:
-    if minutes % SAMPLE_MINUTES:
-        raise ValueError(f"the bench's instants are {SAMPLE_MINUTES} min apart; give a multiple")
+    if minutes % STEP_MINUTES:
+        raise ValueError(f"the bench's instants are {STEP_MINUTES} min apart; give a multiple")
     return minutes
 
 
@@ -110,7 +111,7 @@ class SensorSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: AnyModel = Coloured()
-    sample_minutes: Annotated[int, Field(ge=SAMPLE_MINUTES, le=60), AfterValidator(_multiple)] = SAMPLE_MINUTES
+    sample_minutes: Annotated[int, Field(ge=STEP_MINUTES, le=60), AfterValidator(_multiple)] = STEP_MINUTES
     range: Annotated[tuple[float, float], AfterValidator(_range)] = (40.0, 400.0)
     lifetime_days: Annotated[float, Field(gt=0, le=3650)] | None = None
     renew: bool = True
@@ -132,10 +133,10 @@ class SensorSettings(BaseModel):
     def wear(self, count: int) -> Wear:
         """Which sensor is worn at each of `count` sampling instants, and for how long."""
         lifetime = self.lifetime_days or self.model.lifetime_days
-        life = round(lifetime * INSTANTS_PER_DAY) if lifetime and self.renew else None
+        life = round(lifetime * STEPS_PER_DAY) if lifetime and self.renew else None
         inserted = {effect.first_step for effect in self.effects if isinstance(effect, Replacement)}
         wear = Wear.whole_run(count)
-        session, age = 0, self.worn_minutes // SAMPLE_MINUTES
+        session, age = 0, self.worn_minutes // STEP_MINUTES
         if life is None and not inserted:
             return Wear(wear.session, wear.age + age)
         for k in range(count):
@@ -216,7 +217,7 @@ class Sensor:
             self._place(effect).append(_Running(effect, numbers.tolist(), fault=place >= own))
         self._faults = [running for running in (*self._before, *self._after, *self._last_stages) if running.fault]
         self.faults_acting: list[Effect] = []  # of `faults`, on the newest sample
-        self._every = self.settings.sample_minutes // SAMPLE_MINUTES
+        self._every = self.settings.sample_minutes // STEP_MINUTES
         self._states = self._forced_states()
         self._last: float | None = None  # mg/dL, the sample before
         self._bits = 0  # fault bits since the last status
@@ -235,11 +236,11 @@ class Sensor:
         settings = self.settings
         states = {}
         if settings.warmup_minutes:
-            ready = settings.warmup_minutes / SAMPLE_MINUTES
+            ready = settings.warmup_minutes / STEP_MINUTES
             states = dict.fromkeys(np.flatnonzero(self.wear.age < ready).tolist(), state_code("Warmup"))
         lifetime = settings.lifetime_days or settings.model.lifetime_days
         if lifetime and not settings.renew:
-            old = np.flatnonzero(self.wear.age >= lifetime * INSTANTS_PER_DAY)
+            old = np.flatnonzero(self.wear.age >= lifetime * STEPS_PER_DAY)
             states |= dict.fromkeys(old.tolist(), state_code("Expired"))
         return states
 
@@ -326,7 +327,7 @@ class Sensor:
         return Status(
             fault_bits=self._told,
             session=self._session[step] % SESSIONS,
-            age_minutes=int(self.wear.age[step]) * SAMPLE_MINUTES,
+            age_minutes=int(self.wear.age[step]) * STEP_MINUTES,
             noise=float((self.errors.noise_sd[step] ** 2 + self._extra_variance) ** 0.5),
             battery=self.battery(step),
             dropped=self._dropped,
@@ -340,7 +341,7 @@ class Sensor:
 
     def battery(self, step: int) -> float:
         """Percent left in the transmitter's battery."""
-        left = self.settings.battery_percent - 100 * step / (self.settings.battery_days * INSTANTS_PER_DAY)
+        left = self.settings.battery_percent - 100 * step / (self.settings.battery_days * STEPS_PER_DAY)
         if left > 0 or not self.settings.renew:
             return max(left, 0.0)
         return left % 100 or 100.0

@@ -9,8 +9,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 import dbc
 from can_bus import codec
 from can_bus.batch import Batch, Layout
@@ -19,10 +17,11 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, TURNS_PER_STEP, Done, Phase
 
 from . import mechanism, physiology
+from .body import Body
 from .faults import AnyPumpFault, PumpFault
-from .physiology import Patient, Variability
+from .physiology import Patient
 from .pump import NMT_BOOT_UP, NMT_OPERATIONAL, REPORT, Pump, PumpSettings
-from .scenario import EATING_MINUTES, RESCUE, RESCUE_EATING_MINUTES, Meal, Rescuer, Scenario
+from .scenario import Scenario
 from .sensor import Sensor, SensorSettings
 from .sensors.effects import Effect
 from .user import Plan, User
@@ -158,7 +157,7 @@ class PlantServer:
         self._with_reading = Batch(self._transmitter, (*READING, *rest))
         self._without_reading = Batch(self._transmitter, rest)
         self._receiver = Receiver(message.name for message in dbc.load().messages if message.senders == ["CTRL"])
-        self._patient = _Body(run)
+        self._patient = Body(run.patient, run.plans, run.steps, run.seed, run.variability)
         self._pump_faults = [fault for fault in run.faults if isinstance(fault, PumpFault)]
         sensor_faults = tuple(fault for fault in run.faults if isinstance(fault, Effect))
         self._sensor = Sensor(run.sensor, run.steps + 1, run.seed, run.patient.name, sensor_faults)
@@ -411,8 +410,8 @@ class PlantServer:
     def _confirm_pump_alarms(self) -> list[Frame]:
         """The user confirms what the pump has shown since the last step."""
         frames = []
-        for instance in self.pump.pending_alarms():
-            self.pump.acknowledge(instance)
+        for instance in self.pump.alarms.pending():
+            self.pump.alarms.confirm(instance)
             frames.append(
                 self._transmitter.frame("UI_AlarmAck", AlarmAckNode=2, AlarmAckAction=1, AlarmAckInstance=instance)
             )
@@ -446,88 +445,3 @@ def _ledger(motor: mechanism.Words) -> tuple[int, int, int]:
 def _mode_name(code: int) -> str:
     choices = dbc.load().get_message_by_name("CTRL_Status").get_signal_by_name("CtrlMode").choices
     return str(choices.get(code, code))
-
-
-class _Body:
-    """The patient between the pump and the sensor: what is eaten, how the body varies, where the state is."""
-
-    def __init__(self, run: Run) -> None:
-        self._nominal = run.patient.params
-        self._x = run.patient.x0.copy()
-        self._variability = Variability(run.seed, run.patient.name, run.variability)
-        self._p = self._variability.apply(self._nominal)
-        scenario = run.plans[-1].scenario
-        self._meals = scenario.meals_by_step()
-        self._rules = {plan.step: plan.scenario.rescue for plan in run.plans}
-        self._rescuer: Rescuer | None = None
-        self._carbs = np.zeros((run.steps, mechanism.SUBSTEPS))  # mg eaten in every 30-s step of the run
-        for meal in scenario.meals:
-            self._eat(meal, EATING_MINUTES)
-        self._meal_index = 0
-        self.rescued: Meal | None = None  # sugar eaten at this instant
-
-    def _eat(self, meal: Meal, minutes: int) -> None:
-        """Put a meal on the table; it is eaten evenly over `minutes`."""
-        substeps = int(minutes / physiology.STEP_MIN)
-        start = meal.step * mechanism.SUBSTEPS
-        self._carbs.reshape(-1)[start : start + substeps] += meal.carbs_g * 1000 / substeps
-
-    def feel(self, step: int) -> None:
-        """Eat sugar at this instant if glucose has been low for long enough."""
-        rule = self._rules.get(step)
-        if step in self._rules and rule != (self._rescuer and self._rescuer.rule):
-            self._rescuer = None if rule is None else Rescuer(rule)
-        carbs = self._rescuer.carbs(step, self.glucose) if self._rescuer else 0.0
-        self.rescued = None
-        if carbs:
-            meal = self.rescued = Meal(step, RESCUE, carbs)
-            self._meals.setdefault(step, []).append(meal)
-            self._eat(meal, RESCUE_EATING_MINUTES)
-
-    def carbs_starting(self, step: int) -> float:
-        """Carbohydrate (g) of the meals that start at this instant."""
-        return sum(meal.carbs_g for meal in self._meals.get(step, ()))
-
-    def advance(self, step: int, insulin: np.ndarray, pramlintide: np.ndarray) -> None:
-        """Integrate from instant `step` to the next one."""
-        for meal in self._meals.get(step, ()):
-            if meal.kind != RESCUE:  # sugar shifts no planned meal's random numbers
-                self._p = self._variability.apply(self._nominal, self._variability.meal(self._meal_index), out=self._p)
-                self._meal_index += 1
-            physiology.begin_meal(self._x, self._p, meal.carbs_g * 1000)
-        physiology.advance(self._x, self._p, float(step * STEP_SECONDS // 60), insulin, pramlintide, self._carbs[step])
-
-    @property
-    def glucose(self) -> float:
-        """mg/dL."""
-        return physiology.glucose(self._x, self._p)
-
-    @property
-    def interstitial(self) -> float:
-        """mg/dL."""
-        return physiology.interstitial(self._x, self._p)
-
-    @property
-    def plasma_insulin(self) -> float:
-        """pmol/L."""
-        return physiology.plasma_insulin(self._x, self._p)
-
-    @property
-    def plasma_pramlintide(self) -> float:
-        """pmol/L."""
-        return physiology.plasma_pramlintide(self._x, self._p)
-
-    @property
-    def eta(self) -> float:
-        """Attenuation of gastric emptying, 0 to 1."""
-        return physiology.eta(self._x, self._p)
-
-    @property
-    def q_sto(self) -> float:
-        """Carbohydrate in the stomach, mg."""
-        return physiology.q_sto(self._x, self._p)
-
-    @property
-    def rate_of_appearance(self) -> float:
-        """mg/kg/min."""
-        return physiology.rate_of_appearance(self._x, self._p)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from can_bus.codec import Transmitter
 from can_bus.frame import Frame
+from can_bus.lockstep import STEP_MINUTES
 
 from .scenario import Announcement, Meal, Scenario, announcements, policy_of, rescue_announcement
 from .scenarios.announcing import OFFSET_MAX
@@ -15,8 +16,6 @@ IDS = 255
 
 PATIENCE = 12
 """Steps after which the user gives up on a device that does not echo a meal."""
-
-SAMPLE_MINUTES = 5
 
 
 class Plan(NamedTuple):
@@ -74,7 +73,7 @@ class User:
         meal = self._waiting[0]
         if self._since is None:
             self._since = step
-        offset = min(max((meal.meal_step - step) * SAMPLE_MINUTES, -OFFSET_MAX), OFFSET_MAX)
+        offset = min(max((meal.meal_step - step) * STEP_MINUTES, -OFFSET_MAX), OFFSET_MAX)
         carbs = {} if meal.carbs_g is None else {"CarbsEst": round(meal.carbs_g * 2)}
         return [transmitter.frame("MEAL_Announce", MealKind=meal.kind, MealId=self._number, MealOffset=offset, **carbs)]
 

@@ -16,8 +16,8 @@ from firmware_sim.firmware import Firmware
 from firmware_sim.ladder import State
 from firmware_sim.pump import Op, Pump
 from plant_server.chamber import Chamber, ChamberSettings
-from plant_server.pump import Alarm
 from plant_server.pump import Pump as SimulatedPump
+from plant_server.pump_alarms import Alarm
 
 
 @pytest.mark.parametrize("requirement", [each.id for each in select(["ALM"])])

@@ -12,7 +12,7 @@ from firmware_sim import bolus, meals, pump
 from firmware_sim.bolus import Boluses
 from firmware_sim.ladder import Ladder
 from plant_server import bolus as pump_bolus
-from plant_server.pump import Pump
+from plant_server.set_point import SetPoint
 
 ALARM_DOSE_REJECTED = codec.choice("CTRL_Alarm", "CtrlAlarmCode", "DoseRejected")
 ALARM_UNCERTAIN = codec.choice("CTRL_Alarm", "CtrlAlarmCode", "DeliveryUncertain")
@@ -198,16 +198,16 @@ def test_a_set_point_that_is_not_renewed(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_pump_that_goes_on_beyond_the_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pump, "_expire", lambda *_: None)
+    monkeypatch.setattr(SetPoint, "expire", lambda *_: None)
     expect_failed("CMD-08", "TbrActive 0 2 steps on")
 
 
 def test_a_pump_that_keeps_pramlintide_beyond_the_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fall_back(self: Pump) -> None:
-        self._commanded = False
-        self._rate = self.settings.basal_milliunits_per_h
+    def fall_back(self: SetPoint) -> None:
+        self.commanded = False
+        self.rate = self._schedule
 
-    monkeypatch.setattr(Pump, "_fall_back", fall_back)
+    monkeypatch.setattr(SetPoint, "fall_back", fall_back)
     expect_failed("CMD-08", "the schedule and no pramlintide")
 
 

@@ -18,7 +18,7 @@ from firmware_sim.pump import Op
 from firmware_sim.pump import Pump as PumpSeen
 from firmware_sim.selftest import Failure
 from plant_server.bolus import AckResult, DrugBolus
-from plant_server.pump import Pump
+from plant_server.set_point import SetPoint
 
 
 @pytest.mark.parametrize("requirement", [each.id for each in select(["LIM"])])
@@ -208,7 +208,7 @@ def test_a_cut_that_is_told_again_and_again() -> None:
 
 
 def test_a_pump_that_takes_any_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pump, "_judge_rate", staticmethod(lambda *_: AckResult.ACCEPTED))
+    monkeypatch.setattr(SetPoint, "_judge_rate", staticmethod(lambda *_: AckResult.ACCEPTED))
     expect_failed("LIM-10", "AckResult OverLimit to InsulinRate 6001")
 
 
@@ -218,10 +218,10 @@ def test_a_pump_that_takes_any_bolus(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_pump_that_refuses_and_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    obey = Pump._obey
+    obey = SetPoint._obey
 
-    def obliging(self: Pump, values: Values, step: int, _results: Any) -> None:
+    def obliging(self: SetPoint, values: Values, step: int, _results: Any) -> None:
         obey(self, values, step, (AckResult.ACCEPTED, AckResult.ACCEPTED))
 
-    monkeypatch.setattr(Pump, "_obey", obliging)
+    monkeypatch.setattr(SetPoint, "_obey", obliging)
     expect_failed("LIM-10", "2 strokes with InsulinRate refused")

@@ -25,8 +25,10 @@ import firmware_sim.calibration
 import firmware_sim.cgm
 import firmware_sim.ladder
 import firmware_sim.pump
+import plant_server.bolus
 import plant_server.pump
 import plant_server.sensor
+import plant_server.set_point
 from can_bus import codec, faults, lockstep
 from firmware_sim import firmware
 from firmware_sim.control import core, layout
@@ -374,9 +376,9 @@ def assert_same_codes(members: Iterable[IntEnum], message: str, signal: str, *, 
         (firmware_sim.alarms.Priority, "PUMP_Alarm", "PumpAlarmPriority", True),
         (firmware_sim.ladder.State, "CTRL_Status", "CtrlState", True),
         (firmware_sim.pump.Op, "PUMP_BasalCmd", "BasalOp", False),
-        (plant_server.pump.Op, "PUMP_BasalCmd", "BasalOp", False),
+        (plant_server.set_point.Op, "PUMP_BasalCmd", "BasalOp", False),
         (plant_server.pump.AckFor, "PUMP_Ack", "AckFor", False),
-        (plant_server.pump.AckResult, "PUMP_Ack", "AckResult", False),
+        (plant_server.bolus.AckResult, "PUMP_Ack", "AckResult", False),
         (plant_server.pump.PumpState, "PUMP_Status", "PumpState", False),
     ],
 )
@@ -438,10 +440,10 @@ def high(message: str, signal: str) -> int:
     [
         (core.RATE_MAX, high("PUMP_BasalCmd", "InsulinRate")),
         (core.RATE_MAX, high("PUMP_BasalCmd", "PramlintideRate")),
-        (plant_server.pump.RATE_RESERVED, high("PUMP_BasalCmd", "InsulinRate")),
+        (plant_server.set_point.RATE_RESERVED, high("PUMP_BasalCmd", "InsulinRate")),
         (core.IOB_MAX, high("CTRL_Status", "InsulinOnBoard")),
         (firmware_sim.pump.SEQUENCES, high("PUMP_BasalCmd", "BasalCmdSeq") + 1),
-        (plant_server.pump.SEQUENCES, high("PUMP_BasalCmd", "BasalCmdSeq") + 1),
+        (plant_server.set_point.SEQUENCES, high("PUMP_BasalCmd", "BasalCmdSeq") + 1),
         (firmware_sim.pump.TOTAL_MODULUS, codec.choice("PUMP_Delivered", "InsulinTotal", "Error")),
         (firmware_sim.alarms.INSTANCES, high("CTRL_Alarm", "CtrlAlarmInstance") + 1),
         (firmware_sim.cgm.SEQUENCE_MODULUS, high("CGM_Reading", "CgmSampleSeq") + 1),

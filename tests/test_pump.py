@@ -7,11 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from can_bus import codec
+from can_bus.batch import Batch
 from can_bus.codec import Receiver, Transmitter
 from plant_server import mechanism
 from plant_server.chamber import INSULIN, PRAMLINTIDE, Chamber, Occlusion
 from plant_server.mechanism import COMMANDED, DELIVERED, HELD, LOST, PENDING
-from plant_server.pump import Alarm, Pump, PumpSettings
+from plant_server.pump import REPORT, Pump, PumpSettings
+from plant_server.pump_alarms import Alarm
 
 BASAL = 1200  # 1.2 U/h in 0.001 U/h
 
@@ -34,13 +36,12 @@ class Bench:
         return [self.receiver.receive(frame).values for frame in self.pump.command(values, step, self.transmitter)]
 
     def report(self) -> dict[str, dict[str, int]]:
-        found = [self.receiver.receive(frame) for frame in self.pump.report(self.transmitter)]
-        return {one.name: one.values for one in found}
+        frames = Batch(self.transmitter, REPORT).frames(self.pump.values())
+        return {one.name: one.values for one in map(self.receiver.receive, frames)}
 
     def alarms(self) -> list[tuple[int, int, int]]:
-        found = [self.receiver.receive(frame) for frame in self.pump.report(self.transmitter)]
-        keys = ("PumpAlarmCode", "PumpAlarmState", "PumpAlarmAux")
-        return [tuple(one.values[key] for key in keys) for one in found if one.name == "PUMP_Alarm"]
+        found = [self.receiver.receive(frame).values for frame in self.pump.report_alarms(self.transmitter)]
+        return [tuple(one[key] for key in ("PumpAlarmCode", "PumpAlarmState", "PumpAlarmAux")) for one in found]
 
 
 def results(acks: list[dict[str, int]]) -> list[int]:
@@ -262,8 +263,8 @@ def test_reservoir_low_then_empty_each_said_until_confirmed() -> None:
     bench.pump.deliver(0)  # 2.5 U, 50 strokes
     assert bench.alarms() == [(Alarm.RESERVOIR_LOW, 1, 1)]
     assert bench.alarms() == [(Alarm.RESERVOIR_LOW, 1, 1)]
-    (instance,) = bench.pump.pending_alarms()
-    bench.pump.acknowledge(instance)
+    (instance,) = bench.pump.alarms.pending()
+    bench.pump.alarms.confirm(instance)
     assert bench.alarms() == [(Alarm.RESERVOIR_LOW, 2, 1)]
     assert bench.alarms() == []
     for step in range(1, 10):
@@ -283,7 +284,7 @@ def test_occlusion_names_its_drug_in_status_and_alarm() -> None:
     report = bench.report()
     assert (report["PUMP_Status"]["InsulinOcclusion"], report["PUMP_Status"]["PramOcclusion"]) == (0, 2)
     assert report["PUMP_Status"]["PumpState"] == 3  # insulin goes on
-    assert report["PUMP_Alarm"]["PumpAlarmAux"] == 2
+    assert bench.alarms() == [(Alarm.OCCLUSION, 1, 2)]
 
 
 def test_an_empty_battery_stops_the_pump_and_books_nothing() -> None:

@@ -8,12 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from can_bus import codec
+from can_bus.batch import Batch
 from can_bus.codec import Receiver, Transmitter
 from plant_server import mechanism
 from plant_server.bolus import IDS, AckResult, DrugBolus, Op, Phase
 from plant_server.chamber import INSULIN, PRAMLINTIDE, Chamber
 from plant_server.mechanism import COMMANDED, FLUID, HELD, LOST, PENDING
-from plant_server.pump import AckFor, Pump, PumpSettings
+from plant_server.pump import REPORT, AckFor, Pump, PumpSettings
 
 BASAL = 1200  # 1.2 U/h
 INS, PRAM = 1, 2
@@ -64,7 +65,8 @@ class Bench:
         return total
 
     def report(self) -> list[tuple[str, dict[str, int]]]:
-        found = [self.receiver.receive(frame) for frame in self.pump.report(self.transmitter)]
+        frames = Batch(self.transmitter, REPORT).frames(self.pump.values())
+        found = [self.receiver.receive(frame) for frame in frames]
         return [(one.name, one.values) for one in found]
 
     def state(self, drug: int = INS) -> tuple[int, int, int, int]:

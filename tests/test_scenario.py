@@ -11,11 +11,11 @@ from pumpbench.calibration import MODES
 from scipy import stats
 
 from can_bus import codec
+from can_bus.lockstep import STEPS_PER_DAY
 from plant_server import scenario as scenario_module
 from plant_server.physiology import load_patient
 from plant_server.scenario import (
     RESCUE,
-    STEPS_PER_DAY,
     VALIDATION,
     Announcement,
     Announcing,

@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from can_bus import codec
 from can_bus.frame import CAN_EFF_FLAG, CAN_RTR_FLAG, MAX_DATA, Frame
-from can_bus.lockstep import STEP_SECONDS
+from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY
 
 from .base import FrameFault, Held, Memory
 from .fields import MessageName, known_signal, raw, raw_steps, repaired, with_raw
@@ -42,7 +42,7 @@ class Delay(FrameFault):
 
     CODE: ClassVar[int] = 2
     kind: Literal["delay"] = "delay"
-    steps: Annotated[int, Field(ge=1, le=288)] | None = None
+    steps: Annotated[int, Field(ge=1, le=STEPS_PER_DAY)] | None = None
     ms: Annotated[float, Field(gt=0, le=1000)] | None = None
 
     @model_validator(mode="after")

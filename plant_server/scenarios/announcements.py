@@ -10,9 +10,10 @@ import functools
 from typing import NamedTuple
 
 import dbc
+from can_bus.lockstep import STEP_MINUTES
 
 from ..streams import stream
-from .meals import SAMPLE_MINUTES, SNACK, Meal, Scenario
+from .meals import SNACK, Meal, Scenario
 
 CARBS_MAX = 500.0
 """g, MEAL_Announce.CarbsEst."""
@@ -60,7 +61,7 @@ class Announcement(NamedTuple):
     @property
     def offset_minutes(self) -> int:
         """MEAL_Announce.MealOffset: from now to the start of the meal, negative for one told late."""
-        return (self.meal_step - self.step) * SAMPLE_MINUTES
+        return (self.meal_step - self.step) * STEP_MINUTES
 
 
 def announcements(scenario: Scenario, policy: Policy, seed: int, patient: str) -> tuple[Announcement, ...]:
@@ -88,7 +89,7 @@ def announcements(scenario: Scenario, policy: Policy, seed: int, patient: str) -
         if habits.late is not None and late[k] < habits.late.probability:
             least, most = habits.late.minutes
             minutes = least + (most - least) * delay[k]
-        step = max(meal.step + round(minutes / SAMPLE_MINUTES), 0)
+        step = max(meal.step + round(minutes / STEP_MINUTES), 0)
         carbs = min(habits.estimate.grams(meal.carbs_g, normal[k]), CARBS_MAX)
         if policy is Policy.MAIN_MEALS:
             told.append(Announcement(step, Kind.SIMPLE_MEAL, None, meal.step))

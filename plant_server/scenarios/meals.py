@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
+from can_bus.lockstep import STEP_MINUTES, STEPS_PER_DAY
+
 from .announcing import Announcing
 from .rescue import Rescue
 
-SAMPLE_MINUTES = 5
 MINUTES_PER_DAY = 1440
-STEPS_PER_DAY = MINUTES_PER_DAY // SAMPLE_MINUTES
 
 MAIN_MEALS = ("Breakfast", "Lunch", "Dinner")
 SNACK = "Snack"
@@ -42,7 +42,7 @@ class Scenario(NamedTuple):
 
 def planned(meals: list[tuple[float, str, float]], days: int) -> tuple[Meal, ...]:
     """Meals given as (minutes since the start, kind, g), at the nearest sampling instant, within `days` days."""
-    rounded = (Meal(round(minute / SAMPLE_MINUTES), kind, carbs) for minute, kind, carbs in meals)
+    rounded = (Meal(round(minute / STEP_MINUTES), kind, carbs) for minute, kind, carbs in meals)
     return tuple(
         sorted((meal for meal in rounded if 0 <= meal.step < days * STEPS_PER_DAY), key=lambda meal: meal.step)
     )

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-SAMPLE_MINUTES = 5
+from can_bus.lockstep import STEP_MINUTES, STEPS_PER_DAY
 
 RESCUE_EATING_MINUTES = 5
 """Sugar is eaten faster than a meal."""
@@ -28,7 +28,7 @@ class Rescue(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     below: Annotated[float, Field(ge=20, le=100)] = 60.0
-    samples: Annotated[int, Field(ge=1, le=288)] = 3
+    samples: Annotated[int, Field(ge=1, le=STEPS_PER_DAY)] = 3
     carbs: Annotated[float, Field(gt=0, le=100)] = 15.0
     lockout_minutes: Annotated[float, Field(ge=0, le=1440)] = 30.0
     announced: bool = False
@@ -45,7 +45,7 @@ class Rescuer:
     def carbs(self, step: int, glucose: float) -> float:
         """Grams eaten at sampling instant `step`, at a plasma glucose in mg/dL; to be asked once per instant."""
         self._low = self._low + 1 if glucose < self.rule.below else 0
-        waited = self._eaten is None or (step - self._eaten) * SAMPLE_MINUTES >= self.rule.lockout_minutes
+        waited = self._eaten is None or (step - self._eaten) * STEP_MINUTES >= self.rule.lockout_minutes
         if self._low < self.rule.samples or not waited:
             return 0.0
         self._eaten = step

@@ -10,7 +10,7 @@ from .dexcom_g5 import DexcomG5
 from .dexcom_g6 import DexcomG6
 from .facchinetti2014 import Facchinetti2014
 from .ideal import Ideal
-from .model import INSTANTS_PER_DAY, SAMPLE_MINUTES, Errors, Model, Streams, Wear
+from .model import Errors, Model, Streams, Wear
 from .vettoretti2019 import Vettoretti2019
 
 MODELS: dict[str, type[Model]] = {
@@ -32,9 +32,7 @@ AnyModel = Annotated[
 """A model in a file: its name, or a mapping of its name and parameters."""
 
 __all__ = [
-    "INSTANTS_PER_DAY",
     "MODELS",
-    "SAMPLE_MINUTES",
     "AnyModel",
     "Errors",
     "Model",

@@ -6,7 +6,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import AfterValidator
 
-from .model import SAMPLE_MINUTES, Array
+from can_bus.lockstep import STEP_MINUTES
+
+from .model import Array
 
 WARM_UP = 200
 """Steps left out at the beginning, so that the noise is stationary from the first sample on."""
@@ -44,7 +46,7 @@ class AR2(NamedTuple):
         """Standard deviation of e over that of w."""
         return math.sqrt((1 - self.c2) / ((1 + self.c2) * ((1 - self.c2) ** 2 - self.c1**2)))
 
-    def draw(self, count: int, generator: np.random.Generator, step_minutes: int = SAMPLE_MINUTES) -> Array:
+    def draw(self, count: int, generator: np.random.Generator, step_minutes: int = STEP_MINUTES) -> Array:
         """The process at `count` sampling instants, stationary from the first on.
 
         Args:
@@ -52,7 +54,7 @@ class AR2(NamedTuple):
             generator: of w.
             step_minutes: minutes between k-1 and k.
         """
-        every = SAMPLE_MINUTES // step_minutes
+        every = STEP_MINUTES // step_minutes
         steps = WARM_UP + (count - 1) * every + 1
         error = [0.0, 0.0]
         before, last = 0.0, 0.0

@@ -16,7 +16,9 @@ from typing import Literal
 
 import numpy as np
 
-from .model import SAMPLE_MINUTES, Errors, Model, Streams, Wear, additive
+from can_bus.lockstep import STEP_MINUTES
+
+from .model import Errors, Model, Streams, Wear, additive
 
 PACF = 0.7
 KNOT_MINUTES = 15
@@ -37,12 +39,12 @@ class Breton2008(Model):
     def draw(self, wear: Wear, streams: Streams) -> Errors:
         """Noise alone."""
         generator = streams("")
-        knots = wear.instants * SAMPLE_MINUTES // KNOT_MINUTES + 2
+        knots = wear.instants * STEP_MINUTES // KNOT_MINUTES + 2
         v = generator.standard_normal(knots).tolist()
         e = [v[0]]
         for drive in v[1:]:
             e.append(PACF * (e[-1] + drive))
         # numpy's sinh differs in the last bits between processors; the grid makes the same bytes of the same seed
         error = XI + LAMBDA * np.round(np.sinh((np.array(e) - GAMMA) / DELTA) * GRID) / GRID
-        at = np.arange(wear.instants) * SAMPLE_MINUTES
+        at = np.arange(wear.instants) * STEP_MINUTES
         return additive(np.interp(at, np.arange(knots) * float(KNOT_MINUTES), error), STATIONARY_SD)

@@ -20,8 +20,10 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
+from can_bus.lockstep import STEP_MINUTES
+
 from .autoregression import AR2, ArMinutes
-from .model import SAMPLE_MINUTES, Array, Errors, Model, Streams, Wear
+from .model import Array, Errors, Model, Streams, Wear
 
 Polynomial = tuple[float, float, float]
 
@@ -63,5 +65,5 @@ class Calibrated(Dissected):
 
     def days(self, wear: Wear) -> Array:
         """Days since the last calibration."""
-        minutes = (wear.age * float(SAMPLE_MINUTES)) % (self.calibration_hours * 60)
+        minutes = (wear.age * float(STEP_MINUTES)) % (self.calibration_hours * 60)
         return minutes / (24 * 60)

@@ -21,10 +21,10 @@ from pydantic import Field, model_validator
 
 from can_bus import codec
 from can_bus.faults import Time
-from can_bus.lockstep import STEP_SECONDS
+from can_bus.lockstep import STEP_MINUTES, STEP_SECONDS, STEPS_PER_DAY
 
 from ..injected import Injected
-from .model import INSTANTS_PER_DAY, SAMPLE_MINUTES, Array
+from .model import Array
 
 STATE_OK, STATE_BELOW_RANGE, STATE_ABOVE_RANGE = 1, 4, 5
 """CGM_Reading.CgmState."""
@@ -127,7 +127,7 @@ class Lag(Effect):
     def act(self, reading: Reading, number: float, memory: Memory) -> None:
         """Follow the tissue, from where it was before the window."""
         before = reading.glucose if memory.held is None else memory.held
-        memory.held = before + (1 - math.exp(-SAMPLE_MINUTES / self.minutes)) * (reading.glucose - before)
+        memory.held = before + (1 - math.exp(-STEP_MINUTES / self.minutes)) * (reading.glucose - before)
         reading.glucose = memory.held
 
 
@@ -165,17 +165,17 @@ class CompressionLow(Effect):
             return share
         begins, lengths = generator.random((count, 2)).T
         free = 0
-        for k in np.flatnonzero(begins < self.per_day / INSTANTS_PER_DAY).tolist():
+        for k in np.flatnonzero(begins < self.per_day / STEPS_PER_DAY).tolist():
             if k < free:
                 continue
             length = self.minutes * (0.5 + lengths[k])
-            minutes = np.arange(0.0, length, SAMPLE_MINUTES)[: count - k]
+            minutes = np.arange(0.0, length, STEP_MINUTES)[: count - k]
             share[k : k + len(minutes)] = self._shape(minutes, length - minutes)
             free = k + len(minutes)
         return share
 
     def _shape(self, since: Array, left: Array) -> Array:
-        return np.minimum(1.0, np.minimum(since + SAMPLE_MINUTES, left) / self.ramp_minutes)
+        return np.minimum(1.0, np.minimum(since + STEP_MINUTES, left) / self.ramp_minutes)
 
     def acts(self, step: int, number: float) -> bool:
         """In the episode, or in one of those at random."""

@@ -7,12 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
+from can_bus.lockstep import STEPS_PER_DAY
+
 Array = npt.NDArray[np.float64]
-
-SAMPLE_MINUTES = 5
-"""Between two sampling instants; an error is drawn for every instant, whether or not the sensor shows it."""
-
-INSTANTS_PER_DAY = 24 * 60 // SAMPLE_MINUTES
 
 Streams = Callable[[str], np.random.Generator]
 """A generator for every purpose: "" is the model's first, another word is another, independent stream."""
@@ -32,7 +29,7 @@ class Wear(NamedTuple):
     @property
     def age_days(self) -> Array:
         """Days since the sensor worn at each instant was inserted."""
-        return self.age / INSTANTS_PER_DAY
+        return self.age / STEPS_PER_DAY
 
     @classmethod
     def whole_run(cls, count: int) -> "Wear":
@@ -41,7 +38,7 @@ class Wear(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """One realisation: the sensor shows gain * interstitial glucose + offset, at every sampling instant."""
+    """One realisation: gain * interstitial glucose + offset at every sampling instant, shown by the sensor or not."""
 
     gain: Array  # 1
     offset: Array  # mg/dL, the noise included

@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 import firmware_sim
 import plant_server
+from can_bus.lockstep import STEP_MINUTES
 from firmware_sim.control import layout
 from firmware_sim.pump import RATE_EXPIRES_AFTER
 from plant_server import mechanism, physiology
 from plant_server.chamber import INSULIN, PRAMLINTIDE
 from plant_server.mechanism import DELIVERED, FLUID, MOTOR_WORDS, SUBSTEPS
-from plant_server.scenario import RESCUE_EATING_MINUTES, SAMPLE_MINUTES
+from plant_server.scenario import RESCUE_EATING_MINUTES
 from pumpbench import compiled
 from pumpbench.closed_loop import device, pump
 from pumpbench.compiled import Words, helper
@@ -200,7 +201,7 @@ def run(plan: Plan, record: Record) -> tuple[Words, Words]:
         rescue_mg = 0.0
         if settings[RESCUE_SAMPLES] > 0:
             low_samples = low_samples + 1 if glucose < levels[RESCUE_BELOW] else 0
-            waited = eaten < 0 or (step - eaten) * SAMPLE_MINUTES >= levels[RESCUE_LOCKOUT_MINUTES]
+            waited = eaten < 0 or (step - eaten) * STEP_MINUTES >= levels[RESCUE_LOCKOUT_MINUTES]
             if low_samples >= settings[RESCUE_SAMPLES] and waited:
                 eaten = step
                 rescue_mg = levels[RESCUE_CARBS_MG]
@@ -311,7 +312,7 @@ def run(plan: Plan, record: Record) -> tuple[Words, Words]:
         if settings[CHANGE_EVERY] > 0 and (step + 1) % settings[CHANGE_EVERY] == 0:
             motor[FLUID], pram_motor[FLUID] = INSULIN_PRIMED, PRAM_PRIMED
 
-        # and of the patient (_Body.advance)
+        # and of the patient (Body.advance)
         while next_meal < plan.meals.size and plan.meals[next_meal] == step:
             if plan.meal_body[next_meal] >= 0:
                 body = plan.meal_body[next_meal]
@@ -322,5 +323,5 @@ def run(plan: Plan, record: Record) -> tuple[Words, Words]:
         if rescue_mg > 0.0:
             begin_meal(x, p, rescue_mg)
             carbs += rescue_mg / RESCUE_SUBSTEPS
-        advance(x, p, float(step * SAMPLE_MINUTES), insulin, pramlintide, carbs)
+        advance(x, p, float(step * STEP_MINUTES), insulin, pramlintide, carbs)
     return motor, pram_motor

@@ -1,4 +1,4 @@
-"""The pump's electronics, compiled: `plant_server.pump` and `plant_server.bolus` without faults, on a sound wire.
+"""The pump's electronics, compiled: `plant_server.pump`, its set-points and boluses without faults, on a sound wire.
 
 The motors are those of the plant (`plant_server.mechanism`). As in `device`, every function bears the name of the
 method it repeats.
@@ -7,7 +7,7 @@ method it repeats.
 from plant_server import mechanism
 from plant_server.bolus import STROKE_RAW, Phase
 from plant_server.mechanism import BOLUS_DELIVERED, FLUID, HELD, PENDING
-from plant_server.pump import MILLIUNITS_PER_LSB
+from plant_server.set_point import MILLIUNITS_PER_LSB
 from pumpbench.compiled import Words, helper
 
 begin_bolus = helper(mechanism.begin_bolus)
@@ -23,12 +23,12 @@ PHASE, STROKES = range(2)
 """Words of one drug's newest bolus (`plant_server.bolus.DrugBolus`)."""
 
 
-# ---- set-points (plant_server.pump.Pump)
+# ---- set-points (plant_server.set_point.SetPoint)
 
 
 @helper
 def fall_back(pump: Words, schedule: int) -> None:
-    """`Pump._fall_back` to the stored schedule in 0.001 U/h."""
+    """`SetPoint.fall_back` to the stored schedule in 0.001 U/h."""
     pump[COMMANDED] = 0
     pump[RATE] = schedule
     pump[PRAM_RATE] = 0
@@ -38,7 +38,7 @@ def fall_back(pump: Words, schedule: int) -> None:
 def command(
     pump: Words, rate: int, pram_rate: int, limit: int, pram_limit: int, schedule: int, step: int, ahead: int
 ) -> tuple[bool, bool]:
-    """`Pump.command` with SET_RATE: which of the two drugs' rates was accepted."""
+    """`SetPoint.take` with SET_RATE: which of the two drugs' rates was accepted."""
     accepted, pram_accepted = rate <= limit, pram_rate <= pram_limit
     if accepted or pram_accepted:
         pump[COMMANDED] = 1
@@ -50,7 +50,7 @@ def command(
 
 @helper
 def expire(pump: Words, schedule: int, step: int) -> None:
-    """`Pump._expire`."""
+    """`SetPoint.expire`."""
     if pump[COMMANDED] and step > pump[EXPIRES]:
         fall_back(pump, schedule)
 

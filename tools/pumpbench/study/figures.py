@@ -19,6 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MultipleLocator
 
+from can_bus.lockstep import STEP_MINUTES
 from pumpbench.files import write_file
 from pumpbench.study import paper, statistics
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-SAMPLE_MINUTES: Final = 5
 HOURS: Final = 48
 """Length of the comparisons over time, from the start of the run."""
 
@@ -253,19 +253,19 @@ def ratio_figure(ten: CurveSet, six: CurveSet, meals: Sequence[Meal] = (), hours
 
 def _length(curves: CurveSet, hours: float) -> float:
     """The hours asked for, or those of the longest run, in whole hours."""
-    return min(hours, round(max(len(run.cgm) for run in curves.values()) * SAMPLE_MINUTES / 60))
+    return min(hours, round(max(len(run.cgm) for run in curves.values()) * STEP_MINUTES / 60))
 
 
 def _stack(curves: CurveSet, mode: str, name: str, hours: float) -> Array:
     """Patients x samples of the first seed of a mode, as long as the shortest run."""
     seed = min(key[2] for key in curves if key[1] == mode)
     rows = [np.asarray(getattr(run, name)) for key, run in sorted(curves.items()) if key[1:] == (mode, seed)]
-    length = min([int(hours * 60 / SAMPLE_MINUTES) + 1, *(len(row) for row in rows)])
+    length = min([int(hours * 60 / STEP_MINUTES) + 1, *(len(row) for row in rows)])
     return np.array([row[:length] for row in rows], dtype=float)
 
 
 def _band(axis: Any, rows: Array, colour: str, style: Any, label: str) -> None:
-    hours = np.arange(rows.shape[1]) * SAMPLE_MINUTES / 60
+    hours = np.arange(rows.shape[1]) * STEP_MINUTES / 60
     low, middle, high = bands = np.full((3, rows.shape[1]), np.nan)
     known = ~np.isnan(rows).all(axis=0)  # at some instants no patient has a reading
     bands[:, known] = np.nanpercentile(rows[:, known], [25, 50, 75], axis=0)

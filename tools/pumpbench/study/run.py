@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from can_bus.lockstep import STEP_MINUTES
 from plant_server.scenario import load_scenario
 from pumpbench import campaign
 from pumpbench.campaign import Job, Results
@@ -23,8 +24,6 @@ from pumpbench.study import figures, paper, plan, report, statistics, tables
 from pumpbench.study.plan import Cohort, Law
 
 Say = Callable[[str], None]
-
-STEP_MINUTES: Final = 5
 
 SENSITIVITY_SEEDS: Final = 2
 """So many of the validation's seeds, the first."""
