@@ -11,30 +11,26 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
-import fcntl
 import logging
 import os
 import select
 import signal
 import socket
-import stat
-import struct
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
 import can
 
 from can_bus import hub_wire
-from can_bus.address import Address, BusUrlError, parse_address
-from can_bus.frame import MAX_DATA, RECORD_SIZE, Frame, pack, unpack
+from can_bus.address import BusUrlError, parse_address
+from can_bus.frame import MAX_DATA, RECORD_SIZE
+from can_bus.hub_listener import Listener
+from can_bus.hub_local import LocalLink
 from can_bus.hub_wire import Reason
-from can_bus.link import BaseLink
 
 _log = logging.getLogger("can_bus.hub")
 
@@ -91,8 +87,7 @@ class Hub:
         """
         self._cap = cap
         self._epoll = select.epoll()
-        self._listeners: dict[int, tuple[socket.socket, Address]] = {}
-        self._files: list[tuple[Path, int, int]] = []
+        self._listeners: dict[int, Listener] = {}
         self._clients: dict[int, _Client] = {}
         self._members: tuple[_Client, ...] = ()
         self._leaving = 0
@@ -107,57 +102,13 @@ class Hub:
         self.urls: list[str] = []
         try:
             for url in [urls] if isinstance(urls, str) else urls:
-                self._listen(parse_address(url))
+                listener = Listener(parse_address(url))
+                self._listeners[listener.fileno()] = listener
+                self._epoll.register(listener, _IN)
+                self.urls.append(listener.url)
         except BaseException:
             self.close(linger=0.0)
             raise
-
-    # -- addresses ---------------------------------------------------------------------------------------------
-
-    def _listen(self, address: Address) -> None:
-        listener = socket.socket(address.family, socket.SOCK_STREAM)
-        try:
-            if address.is_tcp:
-                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                listener.bind(address.target)
-                listener.listen(128)
-                host, port = listener.getsockname()[:2]
-                self.urls.append(f"tcp:[{host}]:{port}" if ":" in host else f"tcp:{host}:{port}")
-            else:
-                self._bind_unix(listener, address)
-                self.urls.append(address.url)
-        except OSError as error:
-            listener.close()
-            if error.errno == errno.EADDRINUSE:
-                raise can.CanInitializationError(f"{address.url}: the address is in use by another program") from error
-            raise can.CanInitializationError(f"{address.url}: cannot listen there: {error.strerror}") from error
-        except BaseException:
-            listener.close()
-            raise
-        listener.setblocking(False)
-        self._listeners[listener.fileno()] = (listener, address)
-        self._epoll.register(listener, _IN)
-
-    def _bind_unix(self, listener: socket.socket, address: Address) -> None:
-        """Create the socket file with mode 0600, never open to others even for an instant.
-
-        A socket file nobody serves any more is replaced. The lock on the directory keeps two starting hubs from
-        each taking the other's new file for a stale one.
-        """
-        path = address.path
-        with _directory_lock(path.parent):
-            if path.is_symlink() or path.exists():
-                if not stat.S_ISSOCK(path.lstat().st_mode):
-                    raise can.CanInitializationError(f"{address.url}: a file that is no socket is in the way")
-                if _is_served(path):
-                    raise can.CanInitializationError(f"{address.url}: another hub is serving this path")
-                path.unlink()
-            os.fchmod(listener.fileno(), 0o600)  # on Linux the file inherits the mode of the unbound socket
-            listener.bind(str(path))
-            path.chmod(0o600)
-            listener.listen(128)
-            status = path.stat()
-        self._files.append((path.absolute(), status.st_dev, status.st_ino))
 
     # -- driving it --------------------------------------------------------------------------------------------
 
@@ -226,13 +177,15 @@ class Hub:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
         elif fd in self._listeners:
-            listener, address = self._listeners[fd]
             try:
-                self._accept(*listener.accept(), address)
+                client = _Client(*self._listeners[fd].accept())
             except (BlockingIOError, ConnectionError):
                 pass  # the client went away before we got to it
             except OSError as error:
-                _log.error("%s: cannot accept a client: %s", address.url, error.strerror)
+                _log.error("%s: cannot accept a client: %s", self._listeners[fd].url, error.strerror)
+            else:
+                self._clients[client.fd] = client
+                self._epoll.register(client.sock, _IN)
 
     # -- clients -----------------------------------------------------------------------------------------------
 
@@ -240,11 +193,6 @@ class Hub:
     def clients(self) -> int:
         """How many clients have been welcomed and are still there (local links are not counted)."""
         return len(self._members)
-
-    @property
-    def backlog(self) -> int:
-        """How many frames wait in the hub for its slowest reader; at ``cap`` that reader is disconnected."""
-        return max((len(client.out) for client in self._members), default=0) // RECORD_SIZE
 
     def wait_for_clients(self, count: int, timeout: float) -> None:
         """Switch until ``count`` clients are on the bus; TimeoutError names those that came."""
@@ -262,38 +210,10 @@ class Hub:
                     continue
             self.poll(left)
 
-    def drain(self, below: int = 1, timeout: float = 60.0) -> None:
-        """Switch until fewer than ``below`` frames wait for the slowest reader.
-
-        The host of an embedded hub calls it between steps, so that a recorder slower than the simulation slows the
-        run down in place of being disconnected. TimeoutError after ``timeout`` seconds.
-        """
-        if self.backlog < below:
-            return
-        end = time.monotonic() + timeout
-        while self.backlog >= below:
-            left = end - time.monotonic()
-            if left <= 0:
-                slow = max(self._members, key=lambda client: len(client.out))
-                raise TimeoutError(f"{slow.name} is {self.backlog} frames behind and did not catch up")
-            self.poll(left)
-
     def _set_members(self, members: Iterable[_Client]) -> None:
         with self._changed:
             self._members = tuple(members)
             self._changed.notify_all()
-
-    def _accept(self, sock: socket.socket, peer: object, address: Address) -> None:
-        sock.setblocking(False)
-        if address.is_tcp:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            name = f"client at {peer}"
-        else:
-            pid, _, _ = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
-            name = f"client (pid {pid})"
-        client = _Client(sock, f"{name} on {address.url}", address.is_tcp)
-        self._clients[client.fd] = client
-        self._epoll.register(sock, _IN)
 
     def _read(self, client: _Client) -> bytes:
         """Return the complete records a member sent, b"" when there are none (or it is gone)."""
@@ -501,16 +421,10 @@ class Hub:
         if server is not None and server is not threading.current_thread():
             self.stop()
             server.join()
-        for listener, _ in self._listeners.values():
+        for listener in self._listeners.values():
             self._epoll.unregister(listener)
             listener.close()
         self._listeners.clear()
-        for path, device, inode in self._files:
-            with contextlib.suppress(OSError):
-                status = path.lstat()
-                if (status.st_dev, status.st_ino) == (device, inode):
-                    path.unlink()
-        self._files.clear()
         end = time.monotonic() + linger
         while time.monotonic() < end and self.poll(0):
             pass
@@ -546,87 +460,6 @@ class Hub:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close(linger=0.0 if kind else 5.0)
-
-
-class LocalLink(BaseLink):
-    """The link of the process that hosts a hub; ``recv`` and ``recv`` alone makes the hub switch."""
-
-    def __init__(self, hub: Hub, filters: Iterable[int] | None) -> None:
-        super().__init__(hub.urls[0] if hub.urls else "hub", filters)
-        self._hub = hub
-        self._pending: list[Frame] = []
-
-    def deliver(self, records: bytes) -> None:
-        """Called by the hub: these records are for this link."""
-        frames = unpack(records)
-        if self._wanted is not None:
-            frames = self._wanted.select(frames)
-        self._pending = self._pending + frames if self._pending else frames
-
-    def recv(self, timeout: float | None) -> list[Frame]:
-        """Run the hub until frames for this node arrived; see ``Link.recv``."""
-        hub = self._hub
-        if hub.closed or self._dead is not None:
-            raise self._lose("the hub was closed")
-        if not self._pending:
-            if timeout is None:
-                while not self._pending:
-                    hub.poll(None)
-            else:
-                end = time.monotonic() + timeout
-                hub.poll(timeout)
-                while not self._pending and (left := end - time.monotonic()) > 0:
-                    hub.poll(left)
-        frames = self._pending
-        self._pending = []
-        return frames
-
-    def send(self, frames: Sequence[Frame]) -> None:
-        """Put the batch on the bus; never blocks."""
-        if frames:
-            self.send_packed(pack(frames))
-
-    def send_packed(self, records: bytes) -> None:
-        """Put on the bus what ``pack`` made."""
-        if self._hub.closed or self._dead is not None:
-            raise self._lose("the hub was closed")
-        self._hub.switch_local(self, records)
-
-    def fileno(self) -> int:
-        """The hub's descriptor: it is readable when ``recv(0)`` should be called, which may return nothing."""
-        return self._hub.fileno()
-
-    def close(self) -> None:
-        """Leave the bus; the hub stays."""
-        if self._dead is None:
-            self._closed()
-            self._hub.detach(self)
-
-
-@contextlib.contextmanager
-def _directory_lock(directory: Path) -> Iterator[None]:
-    try:
-        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError as error:
-        raise can.CanInitializationError(f"unix:{directory}: {error.strerror}") from error
-    try:
-        with contextlib.suppress(OSError):  # some network file systems have no locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _is_served(path: Path) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect(str(path))
-        except (ConnectionRefusedError, FileNotFoundError):
-            return False
-        except OSError:  # a full backlog, or somebody else's socket: in any case not ours to remove
-            return True
-        return True
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,7 +20,8 @@ from rerun.chunk import RrdReader
 from synthetic_capture import Loop
 
 from can_bus.frame import Frame
-from can_bus.hub import Hub, LocalLink
+from can_bus.hub import Hub
+from can_bus.hub_local import LocalLink
 
 RECORDER = [sys.executable, "-m", "pumpbench", "record"]
 LIMIT = 60.0

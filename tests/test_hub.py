@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import logging
 import os
 import re
@@ -15,6 +16,7 @@ import stat
 import struct
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -452,7 +454,8 @@ def test_closing_the_hub_delivers_what_waits_and_says_goodbye(hub: Hub) -> None:
     local, slow = hub.local_link(), joined(hub)
     local.send(frames(50_000))
     if slow.url.startswith("unix"):  # the kernel takes less of it than TCP
-        assert hub.backlog > 10_000
+        taken = int.from_bytes(fcntl.ioctl(slow.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
+        assert taken < 40_000 * RECORD_SIZE, "the rest waits in the hub"
     seen: list[Frame] = []
     ends: list[str] = []
 
@@ -517,20 +520,6 @@ def test_waiting_for_clients_of_a_hub_in_another_thread(hub: Hub) -> None:
         hub.wait_for_clients(1, LIMIT)
     with pytest.raises(ValueError, match="already being served"):
         hub.start()
-
-
-def test_draining_waits_for_the_slowest_reader(hub: Hub) -> None:
-    local, slow = hub.local_link(), joined(hub)
-    hub.drain()
-    local.send(frames(20_000))
-    with pytest.raises(TimeoutError, match=r"frames behind and did not catch up"):
-        hub.drain(below=1000, timeout=0.05)
-    reader = threading.Thread(target=collect, args=(slow, 20_000))
-    reader.start()
-    hub.drain(below=1000, timeout=LIMIT)
-    assert hub.backlog < 1000
-    hub.drain()
-    reader.join()
 
 
 def test_local_links_hear_each_other_and_the_clients(hub: Hub) -> None:
