@@ -6,7 +6,6 @@ import os
 import queue
 import select
 import threading
-import time
 from collections.abc import Iterable, Sequence
 
 import can
@@ -77,17 +76,7 @@ class PythonCanLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return the frames that wait, waiting for the first; CAN FD frames of others are skipped."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while True:
-            frames = self._receive(timeout)
-            if frames and self._wanted is not None:
-                frames = self._wanted.select(frames)
-            if frames:
-                return frames
-            if end is not None:
-                timeout = end - time.monotonic()
-                if timeout <= 0:
-                    return frames
+        return self._receive_wanted(self._receive, timeout)
 
     def _receive(self, timeout: float | None) -> list[Frame]:
         if self._dead is not None:

@@ -18,6 +18,7 @@ CAN_ERR_FLAG: Final = 0x20000000
 CAN_SFF_MASK: Final = 0x000007FF
 CAN_EFF_MASK: Final = 0x1FFFFFFF
 MAX_DATA: Final = 8
+TOO_LONG: Final = "not a classic CAN frame: more than 8 data bytes"
 
 RECORD: Final = struct.Struct("<IB3x8s")
 RECORD_SIZE: Final = RECORD.size
@@ -89,7 +90,7 @@ def to_message(frame: Frame, timestamp: float = 0.0, channel: str | None = None,
     """Return the frame as a python-can message; raises ValueError when it is no valid classic frame."""
     can_id, data = frame
     if len(data) > MAX_DATA:
-        raise ValueError("not a classic CAN frame: more than 8 data bytes")
+        raise ValueError(TOO_LONG)
     remote = bool(can_id & CAN_RTR_FLAG)
     return can.Message(
         timestamp=timestamp,
@@ -122,5 +123,5 @@ def from_message(message: can.Message) -> Frame:
     else:
         data = bytes(message.data)
     if len(data) > MAX_DATA:
-        raise ValueError("not a classic CAN frame: more than 8 data bytes")
+        raise ValueError(TOO_LONG)
     return Frame(can_id, data)

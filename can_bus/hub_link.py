@@ -6,7 +6,6 @@ import contextlib
 import fcntl
 import select
 import socket
-import struct
 import termios
 import threading
 import time
@@ -18,20 +17,13 @@ from can_bus import hub_wire
 from can_bus.address import Address, parse_address
 from can_bus.frame import MAX_DATA, RECORD_SIZE, Frame, pack, unpack
 from can_bus.link import BaseLink, BusLost
+from can_bus.timeval import SHORT, timeval
 
 _CHUNK = 16384  # larger allocations cost more than the second receive they save
-SHORT = 0.1  # SO_RCVTIMEO counts in jiffies of up to 10 ms; waits below this use poll, which is exact
 _SEND_LIMIT = 60.0
 _CLOSE_LIMIT = 2.0
 _RETRY = 0.02
-_TIMEVAL = struct.Struct("@ll")
 _LEN_OF_LAST = hub_wire.LEN_OFFSET - RECORD_SIZE
-
-
-def timeval(seconds: float) -> bytes:
-    """Return a struct timeval; zero would mean "for ever" to the kernel, so it becomes the shortest wait."""
-    micros = min(max(1, round(seconds * 1e6)), 10**15)
-    return _TIMEVAL.pack(micros // 1_000_000, micros % 1_000_000)
 
 
 class HubLink(BaseLink):
@@ -109,27 +101,14 @@ class HubLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return all frames that arrived, waiting for the first; see ``Link.recv``."""
-        if self._wanted is None:
+        if self._wanted is None:  # the common case needs no clock
             return self._receive(timeout, _CHUNK)
-        end = None if timeout is None else time.monotonic() + timeout
-        while True:
-            frames = self._receive(timeout, _CHUNK)
-            chosen = self._wanted.select(frames)
-            if chosen or not frames:
-                return chosen
-            if end is not None:
-                timeout = max(0.0, end - time.monotonic())
+        return self._receive_wanted(lambda left: self._receive(left, _CHUNK), timeout)
 
     def recv_one(self, timeout: float | None) -> Frame | None:
         """Return one frame, or None on time-out; the next one stays in the socket, where ``select`` sees it."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while True:
-            frames = self._receive(timeout, RECORD_SIZE - len(self._partial))
-            chosen = frames if self._wanted is None else self._wanted.select(frames)
-            if chosen or not frames:
-                return chosen[0] if chosen else None
-            if end is not None:
-                timeout = max(0.0, end - time.monotonic())
+        frames = self._receive_wanted(lambda left: self._receive(left, RECORD_SIZE - len(self._partial)), timeout)
+        return frames[0] if frames else None
 
     def _receive(self, timeout: float | None, size: int) -> list[Frame]:
         try:
@@ -179,8 +158,7 @@ class HubLink(BaseLink):
     def _set_timeout(self, timeout: float | None) -> None:
         """Let the kernel bound the next receives: one system call less than poll and receive."""
         if self._dead is None:
-            value = _TIMEVAL.pack(0, 0) if timeout is None else timeval(timeout)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeval(timeout))
             self._timeout = timeout
 
     def send(self, frames: Sequence[Frame]) -> None:

@@ -7,12 +7,11 @@ import itertools
 import logging
 import os
 import threading
-import time
 from collections.abc import Iterable, Sequence
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from can_bus.frame import CAN_RTR_FLAG, MAX_DATA, Frame
+from can_bus.frame import CAN_RTR_FLAG, MAX_DATA, TOO_LONG, Frame
 from can_bus.link import BaseLink
 
 _log = logging.getLogger("can_bus.inproc")
@@ -129,17 +128,9 @@ class InprocLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return all frames that wait, waiting for the first; see ``Link.recv``."""
-        wanted = self._wanted
-        end = None if timeout is None or wanted is None else time.monotonic() + timeout
-        while True:
-            frames = self._take(timeout)
-            if wanted is None or not frames:
-                return frames
-            frames = wanted.select(frames)
-            if frames or timeout == 0:
-                return frames
-            if end is not None:
-                timeout = max(0.0, end - time.monotonic())
+        if self._wanted is None:  # the common case needs no clock
+            return self._take(timeout)
+        return self._receive_wanted(self._take, timeout)
 
     def recv_one(self, timeout: float | None) -> Frame | None:
         """Return one frame, or None on time-out; the others wait for the next call."""
@@ -216,7 +207,7 @@ def _checked(frames: Sequence[Frame]) -> list[Frame]:
     for frame in frames:
         can_id, data = frame
         if len(data) > MAX_DATA:
-            raise ValueError("not a classic CAN frame: more than 8 data bytes")
+            raise ValueError(TOO_LONG)
         if not 0 <= can_id <= 0xFFFFFFFF:
             raise ValueError("not a classic CAN frame: the id does not fit 32 bits")
         if can_id & CAN_RTR_FLAG or type(data) is not bytes or type(frame) is not Frame:

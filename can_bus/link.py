@@ -6,7 +6,8 @@ per frame. Everything here blocks plainly in the calling thread; there is no Not
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -101,6 +102,20 @@ class BaseLink:
     def close(self) -> None:
         """Leave the bus; a second call does nothing."""
         raise NotImplementedError
+
+    def _receive_wanted(self, receive: Callable[[float | None], list[Frame]], timeout: float | None) -> list[Frame]:
+        """What `receive` gives and the filter lets pass, asked until there is something or the time is over."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while True:
+            frames = receive(timeout)
+            if self._wanted is not None:
+                frames = self._wanted.select(frames)
+            if frames:
+                return frames
+            if end is not None:
+                timeout = end - time.monotonic()
+                if timeout <= 0:
+                    return frames
 
     def _lose(self, reason: str) -> BusLost:
         """Remember why this link ended (the first reason stays) and return the error to raise."""

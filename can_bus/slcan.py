@@ -7,13 +7,21 @@ import os
 import re
 import select
 import threading
-import time
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import can
 
-from can_bus.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, MAX_DATA, Frame
+from can_bus.frame import (
+    CAN_EFF_FLAG,
+    CAN_EFF_MASK,
+    CAN_ERR_FLAG,
+    CAN_RTR_FLAG,
+    CAN_SFF_MASK,
+    MAX_DATA,
+    TOO_LONG,
+    Frame,
+)
 from can_bus.link import BaseLink
 
 _log = logging.getLogger("can_bus.slcan")
@@ -68,17 +76,7 @@ class SlcanLink(BaseLink):
 
     def recv(self, timeout: float | None) -> list[Frame]:
         """Return all frames that arrived, waiting for the first; see ``Link.recv``."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while True:
-            frames = self._parse(self._read(timeout))
-            if self._wanted is not None:
-                frames = self._wanted.select(frames)
-            if frames:
-                return frames
-            if end is not None:
-                timeout = end - time.monotonic()
-                if timeout <= 0:
-                    return frames
+        return self._receive_wanted(lambda left: self._parse(self._read(left)), timeout)
 
     def _read(self, timeout: float | None) -> bytes:
         if self._dead is not None:
@@ -181,7 +179,7 @@ def _line(frame: Frame) -> bytes:
     if can_id & CAN_ERR_FLAG:
         raise ValueError("slcan cannot carry error frames")
     if len(data) > MAX_DATA:
-        raise ValueError("not a classic CAN frame: more than 8 data bytes")
+        raise ValueError(TOO_LONG)
     remote = bool(can_id & CAN_RTR_FLAG)
     digits = "" if remote else data.hex().upper()
     if can_id & CAN_EFF_FLAG:

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Sequence
 import can
 
 from can_bus.frame import CAN_EFF_MASK, RECORD_SIZE, Frame, pack, unpack
-from can_bus.hub_link import SHORT, timeval
 from can_bus.link import BaseLink
+from can_bus.timeval import SHORT, timeval
 
 _AF_CAN = 29
 _CAN_RAW = 1

@@ -23,9 +23,9 @@ from typing import Final, NamedTuple, TypedDict
 from can_bus.address import parse_address
 from can_bus.frame import RECORD_SIZE, Frame, pack
 from can_bus.hub import Hub
-from can_bus.hub_link import timeval
 from can_bus.link import Link
 from can_bus.socketcan import MSG_WAITFORONE, FrameBatch
+from can_bus.timeval import timeval
 from can_bus.url import open_link
 
 _LIMIT: Final = 30.0
