@@ -24,32 +24,6 @@ def as_it_is(_name: str, values: Values) -> Values:
     return values
 
 
-class Changed:
-    """The reference behind something that changes what it hears, or what it says."""
-
-    def __init__(self, hears: Change = as_it_is, says: Change = as_it_is) -> None:
-        self._device = reference()
-        self._hears, self._says = hears, says
-        self.can_restart = True
-        self.finished = False
-
-    def receive(self, frame: Frame) -> Sequence[Frame]:
-        """What the device says, changed."""
-        heard = _changed(frame, self._hears)
-        return [] if heard is None else self._said(self._device.receive(heard))
-
-    def _said(self, frames: Sequence[Frame]) -> list[Frame]:
-        return [said for said in (_changed(frame, self._says) for frame in frames) if said is not None]
-
-    def restart(self, *how: object) -> Sequence[Frame]:
-        """As the reference."""
-        return self._said(self._device.restart(*how))  # type: ignore[arg-type]
-
-    def renew(self) -> None:
-        """As the reference."""
-        self._device.renew()
-
-
 class Wired:
     """The reference behind something that hands on other frames than came, or more of them, or none."""
 
@@ -65,27 +39,36 @@ class Wired:
 
     def receive(self, frame: Frame) -> Sequence[Frame]:
         """What the device says to all that it hears."""
-        said = [answer for heard in self._hears(frame) for answer in self._device.receive(heard)]
-        return [other for answer in said for other in self._says(answer)]
+        return [said for heard in self._hears(frame) for said in self._said(self._device.receive(heard))]
+
+    def _said(self, frames: Sequence[Frame]) -> list[Frame]:
+        return [other for said in frames for other in self._says(said)]
 
     def restart(self, *how: object) -> Sequence[Frame]:
         """As the reference."""
-        return self._device.restart(*how)  # type: ignore[arg-type]
+        return self._said(self._device.restart(*how))  # type: ignore[arg-type]
 
     def renew(self) -> None:
         """As the reference."""
         self._device.renew()
 
 
-def _changed(frame: Frame, change: Change) -> Frame | None:
+class Changed(Wired):
+    """The reference behind something that changes what it hears, or what it says."""
+
+    def __init__(self, hears: Change = as_it_is, says: Change = as_it_is) -> None:
+        super().__init__(lambda frame: _changed(frame, hears), lambda frame: _changed(frame, says))
+
+
+def _changed(frame: Frame, change: Change) -> list[Frame]:
     message = codec.messages_by_id().get(frame.can_id)
     if message is None or len(frame.data) != message.length:
-        return frame
+        return [frame]
     before = message.unpack(frame.data)
     after = change(message.name, dict(before))
-    if after is None or after == before:
-        return None if after is None else frame
-    return Frame(frame.can_id, repaired(message, with_raw(message, frame.data, after)))
+    if after is None:
+        return []
+    return [frame if after == before else Frame(frame.can_id, repaired(message, with_raw(message, frame.data, after)))]
 
 
 def built_from(node: Callable[[], Node]) -> InProcess:

@@ -1,7 +1,7 @@
 """The benchmark's parts run and are what they are called, and the page is made of the figures."""
 
 from pumpbench.benchmark import beside, page, parts
-from pumpbench.benchmark.round_trips import Figure
+from pumpbench.benchmark.figure import Figure
 
 
 def test_every_part_gives_a_figure_with_its_ceiling() -> None:

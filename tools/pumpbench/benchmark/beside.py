@@ -19,7 +19,7 @@ from can_bus.lockstep import STEPS_PER_DAY
 from plant_server.serve import serve
 from plant_server.server import PlantServer
 from pumpbench import rig
-from pumpbench.benchmark.round_trips import Figure, figure
+from pumpbench.benchmark.figure import Figure, figure
 
 PATIENT = "adult#002"
 LIMIT = 60.0

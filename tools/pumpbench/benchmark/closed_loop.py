@@ -27,7 +27,8 @@ from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from pumpbench import rig
 from pumpbench.benchmark import beside, parts, simglucose_peer
-from pumpbench.benchmark.round_trips import CEILING_OF, Figure, figure, measure, round_trips, vcan_available
+from pumpbench.benchmark.figure import Figure, figure
+from pumpbench.benchmark.round_trips import CEILING_OF, measure, round_trips, vcan_available
 from pumpbench.calibration import MODES
 from pumpbench.closed_loop import Case, simulate
 from pumpbench.trace import decode
@@ -92,9 +93,10 @@ def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
             values.append((last - first) / STEPS_PER_DAY / (ended - started))
             if kind != "inproc":
                 to_device, back = _frames_per_step(out)
-                single = measure(CEILING_OF[kind], 2000, 1, 1, False)
+                single = measure(CEILING_OF[kind], 2000)
                 ceilings.append(single.rate / (to_device + back) / STEPS_PER_DAY)
-                exchanges.append(measure(CEILING_OF[kind], 2000, to_device, back, True).rate / STEPS_PER_DAY)
+                whole = measure(CEILING_OF[kind], 2000, to_device, back, listener=True)
+                exchanges.append(whole.rate / STEPS_PER_DAY)
     if kind == "inproc":
         return [figure("closed-loop/inproc", UNIT, values, [plant_alone(days=20, runs=3)[0]["value"]])]
     name = f"closed-loop/{kind}"
@@ -160,7 +162,7 @@ def all_figures(*, quick: bool, only_vcan: bool = False, peers: bool = True) -> 
     steps = 500 if quick else 5000
     if only_vcan:
         return [
-            *round_trips(["vcan"], steps=steps // 2, runs=runs),
+            *round_trips("vcan", steps=steps // 2, runs=runs),
             *closed_loop("vcan", days=1, runs=min(runs, 3)),
         ]
     figures = plant_alone(days=10 if quick else 100, runs=runs)
@@ -169,7 +171,7 @@ def all_figures(*, quick: bool, only_vcan: bool = False, peers: bool = True) -> 
     figures += beside.figures(days=days, runs=runs)
     if peers:
         figures += simglucose_peer.compare(runs=1 if quick else 3, days=10 if quick else 100)
-    figures += round_trips(["hub"], steps=steps, runs=runs)
+    figures += round_trips("hub", steps=steps, runs=runs)
     figures += [*closed_loop("inproc", days=days, runs=runs), *closed_loop("hub", days=days, runs=runs)]
     if vcan_available():
         return figures + all_figures(quick=quick, only_vcan=True)

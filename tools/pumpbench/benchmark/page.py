@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pumpbench import __version__
-from pumpbench.benchmark.round_trips import Figure
+from pumpbench.benchmark.figure import Figure
 
 PACKAGES = ("numpy", "numba", "python-can", "cantools", "pyarrow", "rerun-sdk")
 

@@ -19,7 +19,7 @@ from can_bus.lockstep import STEPS_PER_DAY
 from firmware_sim.firmware import Firmware
 from plant_server.server import PlantServer
 from pumpbench import rig
-from pumpbench.benchmark.round_trips import Figure, figure
+from pumpbench.benchmark.figure import Figure, figure
 from pumpbench.capture import Capture
 from pumpbench.closed_loop import Case, simulate
 from pumpbench.recorder import write

@@ -36,7 +36,7 @@ import numpy.typing as npt
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from plant_server.physiology import states as st
-from pumpbench.benchmark.round_trips import Figure
+from pumpbench.benchmark.figure import Figure
 
 VERSION: Final = "0.2.11"
 REQUIREMENTS: Final = (f"simglucose=={VERSION}", "gym==0.9.4", "setuptools<81", "numpy<3", "pandas<4", "scipy<2")
