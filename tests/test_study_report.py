@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.image import imread
-from pumpbench.study import figures, paper, report, statistics
+from pumpbench.study import figures, paper, report, selection, statistics
 from study_results import synthetic_runs
 
 MEALS = [(605.0, 64.9), (710.0, 47.7), (730.0, 40.6), (2045.0, 84.4)]
@@ -246,7 +246,7 @@ def test_figures_are_what_there_is_data_for(tmp_path: Path) -> None:
 
 
 def test_boxes_are_those_of_the_patients_and_the_chosen_dose_is_marked() -> None:
-    runs = statistics.dose_runs(synthetic_runs().query("part == 'tuning'"), "s2")
+    runs = selection.dose_runs(synthetic_runs().query("part == 'tuning'"), "s2")
     figure = figures.tuning_figure(runs, "s2")
     assert [axis.get_ylabel().split("\n")[0] for axis in figure.axes] == [
         *("70–180 mg/dL", "above 180 mg/dL", "below 70 mg/dL", "pramlintide"),
@@ -263,7 +263,7 @@ def test_boxes_are_those_of_the_patients_and_the_chosen_dose_is_marked() -> None
         for i, box in enumerate(first.patches)
         if box.get_facecolor()[:3] == pytest.approx((0.902, 0.624, 0), abs=0.01)
     ]
-    assert chosen == [list(by_hand.index).index(float(statistics.select(runs).label.removeprefix("ratio=")))]
+    assert chosen == [list(by_hand.index).index(float(selection.select(runs).label.removeprefix("ratio=")))]
     marks = [line for line in first.lines if line.get_marker() == "v"]
     assert [mark.get_xdata()[0] for mark in marks] == [3]  # the paper's 10 ug/U
 
@@ -296,4 +296,4 @@ def test_tuning_runs_without_their_dose_are_refused() -> None:
     runs = synthetic_runs()
     runs.loc[(runs["part"] == "tuning") & (runs["label"] == "phi=30"), "phi_ug"] = np.nan
     with pytest.raises(ValueError, match="tuning of s3: no phi_ug in phi=30"):
-        statistics.dose_runs(runs[runs["part"] == "tuning"], "s3")
+        selection.dose_runs(runs[runs["part"] == "tuning"], "s3")

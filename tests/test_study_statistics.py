@@ -9,7 +9,7 @@ import pytest
 import statsmodels.formula.api as smf
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pumpbench.study import paper, statistics, tables
+from pumpbench.study import mixed_model, paper, selection, statistics, tables
 from scipy import stats
 from study_results import synthetic_runs
 
@@ -139,7 +139,7 @@ def test_published_example_of_a_randomised_block() -> None:
     values = np.array([[9.3, 9.4, 9.2, 9.7], [9.4, 9.3, 9.4, 9.6], [9.6, 9.8, 9.5, 10.0], [10.0, 9.9, 9.7, 10.2]])
     # Montgomery, Design and Analysis of Experiments, hardness testing (four tips on four coupons): SS_error 0.0800,
     # 9 degrees of freedom
-    fitted = statistics.fit(pd.DataFrame(values, columns=["s1", "s2", "s3", "s4"]))
+    fitted = mixed_model.fit(pd.DataFrame(values, columns=["s1", "s2", "s3", "s4"]))
     assert fitted.covariance.loc["s1", "s1"] * 4 == pytest.approx(0.0800 / 9, abs=1e-6)
 
 
@@ -156,10 +156,10 @@ def test_closed_form_is_the_fitted_model(seed: int, between: float) -> None:
 def test_patients_that_differ_less_than_chance_give_the_boundary_fit() -> None:
     values = drawn(3, between=0.0)
     values -= values.mean(axis=1, keepdims=True)  # no variance between patients at all
-    fitted = statistics.fit(pd.DataFrame(values, columns=paper.MODES))
+    fitted = mixed_model.fit(pd.DataFrame(values, columns=paper.MODES))
     pooled = values.var(axis=0, ddof=1).mean()
     assert fitted.covariance.loc["s1", "s1"] == pytest.approx(pooled / 10)
-    model = statistics.fit(pd.DataFrame(values, columns=paper.MODES), closed_form=False)
+    model = mixed_model.fit(pd.DataFrame(values, columns=paper.MODES), closed_form=False)
     assert model.method == "least squares"
     assert model.covariance.loc["s1", "s1"] == pytest.approx(pooled / 10)
 
@@ -381,45 +381,45 @@ def tuning_table(*candidates: tuple[str, float, float, float]) -> pd.DataFrame:
 def test_the_least_pramlintide_of_similar_tunings_is_chosen() -> None:
     # as the paper tells of strategy 3: 15 and 30 ug alike in range, fewest hypoglycaemias with 15
     table = tuning_table(("phi=15", 94.7, 0.1, 62), ("phi=30", 94.9, 0.3, 124), ("phi=300", 80, 12, 1240))
-    chosen = statistics.select(table)
+    chosen = selection.select(table)
     assert chosen.label == "phi=15"
     assert "least pramlintide of 2 of 3 tunings" in chosen.why
     assert list(chosen.candidates["similar"]) == [True, True, False]
 
 
 def test_more_time_in_range_beats_less_pramlintide() -> None:
-    assert statistics.select(tuning_table(("phi=15", 90, 0, 60), ("phi=30", 92, 0, 120))).label == "phi=30"
+    assert selection.select(tuning_table(("phi=15", 90, 0, 60), ("phi=30", 92, 0, 120))).label == "phi=30"
 
 
 def test_hypoglycaemia_rules_out_what_is_longest_in_range() -> None:
     table = tuning_table(("phi=15", 94.2, 3.0, 60), ("phi=30", 94.5, 0.2, 120), ("phi=45", 95.0, 2.0, 180))
-    assert statistics.select(table).label == "phi=30"
+    assert selection.select(table).label == "phi=30"
 
 
 def test_a_tie_goes_to_the_longer_time_in_range() -> None:
     table = tuning_table(("z=1", 94.2, 0, 60), ("z=3", 94.5, 0, 60), ("z=2", 94.5, 0, 60))
-    assert statistics.select(table).label == "z=2"
+    assert selection.select(table).label == "z=2"
 
 
 @given(st.lists(st.tuples(st.floats(50, 99), st.floats(0, 9), st.floats(1, 400)), min_size=1, max_size=8))
 def test_what_is_chosen_is_never_beaten_in_everything(numbers: list[tuple[float, float, float]]) -> None:
     table = tuning_table(*((f"c{i}", *values) for i, values in enumerate(numbers)))
-    chosen = statistics.select(table)
+    chosen = selection.select(table)
     row = chosen.candidates.set_index("label").loc[chosen.label]
-    assert row["tir_70_180"] >= chosen.candidates["tir_70_180"].max() - statistics.TIR_MARGIN - 1e-9
+    assert row["tir_70_180"] >= chosen.candidates["tir_70_180"].max() - selection.TIR_MARGIN - 1e-9
     similar = chosen.candidates[chosen.candidates["similar"]]
     assert row["pramlintide_ug_per_day"] == similar["pramlintide_ug_per_day"].min()
-    assert row["tbr_70"] <= similar["tbr_70"].min() + statistics.TBR_MARGIN + 1e-9
+    assert row["tbr_70"] <= similar["tbr_70"].min() + selection.TBR_MARGIN + 1e-9
 
 
 def test_tuning_that_cannot_be_judged_is_refused() -> None:
     table = tuning_table(("phi=15", 90, 0, 60), ("phi=30", 92, 0, 120))
     with pytest.raises(ValueError, match="no run of phi=30 for adult#002"):
-        statistics.select(table.iloc[:-1])
+        selection.select(table.iloc[:-1])
     with pytest.raises(ValueError, match="runs of one strategy expected, got s2 s3"):
-        statistics.select(pd.concat([table, table.assign(mode="s2")]))
+        selection.select(pd.concat([table, table.assign(mode="s2")]))
     with pytest.raises(ValueError, match="got none"):
-        statistics.select(table.iloc[:0])
+        selection.select(table.iloc[:0])
 
 
 # --------------------------------------------------------------------------------------------------------------- tables

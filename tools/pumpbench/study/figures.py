@@ -21,7 +21,7 @@ from matplotlib.ticker import MultipleLocator
 
 from can_bus.lockstep import STEP_MINUTES
 from pumpbench.files import write_file
-from pumpbench.study import paper, statistics
+from pumpbench.study import paper, selection, statistics
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -92,7 +92,7 @@ def write_figures(
     figures = {"contrasts": contrasts_figure(statistics.compare(statistics.contrasts(statistics.validation(runs))))}
     tuning = runs[runs["part"] == "tuning"]
     for strategy in paper.STRATEGIES:
-        part = statistics.dose_runs(tuning, strategy)
+        part = selection.dose_runs(tuning, strategy)
         if len(part):
             figures[f"tuning_{strategy}"] = tuning_figure(part, strategy)
     if curves and any(mode in STYLES for _, mode, _ in curves):
@@ -165,7 +165,7 @@ def tuning_figure(runs: pd.DataFrame, strategy: str) -> Figure:
     """
     column, name, unit = paper.DOSES[strategy]
     doses = runs.groupby("label")[column].first().sort_values()
-    chosen = statistics.select(runs).label
+    chosen = selection.select(runs).label
     figure, axes = _figure(7.2, 6.0, 2, 2, sharex=True)
     for axis, metric in zip(axes.flat, TUNING_PANELS, strict=True):
         table = statistics.per_patient(runs.assign(mode=runs["label"]), metric)

@@ -1,7 +1,7 @@
 """What the study simulates, in the order of its choices; those of the controller are frozen before the validation.
 
 1. The law, on the tuning scenario: the gain of every patient and the filter's theta from runs of NMA, the deducted
-   share of a bolus from runs of MA. Each is chosen by the paper's rule (`statistics.select`): the longest time in range
+   share of a bolus from runs of MA. Each is chosen by the paper's rule (`selection.select`): the longest time in range
    with the lowest time below 70 mg/dL, and of similar ones the gentlest, as for pramlintide the smallest dose.
 2. The strategies, on the same scenario: strategy 1's thresholds by exhaustive search, then doses and ratios.
 3. The validation, on other meals and on seeds that nothing was chosen on.
@@ -19,7 +19,7 @@ import pandas as pd
 from pumpbench.calibration import MODES, Tuning, tuning_for
 from pumpbench.campaign import Job
 from pumpbench.controller_model import ControllerModel
-from pumpbench.study import paper, statistics
+from pumpbench.study import paper, selection
 
 TUNING_SEEDS: Final = (1, 2)
 VALIDATION_SEEDS: Final = tuple(range(1001, 1011))
@@ -140,13 +140,13 @@ def choose_gains(runs: pd.DataFrame, patients: Iterable[str]) -> tuple[float, di
         gains = {}
         for patient in patients:
             own = of_theta[of_theta["patient"] == patient]
-            label = statistics.select(own, least="gain").label
+            label = selection.select(own, least="gain").label
             gains[patient] = float(label.split("gain=")[1])
             best.append(own[own["label"] == label].assign(label=f"theta={theta:g}"))
         chosen[float(theta)] = gains
-    selection = statistics.select(pd.concat(best, ignore_index=True), least="speed")
-    theta = float(selection.label.removeprefix("theta="))
-    return theta, chosen[theta], selection.candidates.assign(chosen=selection.candidates["label"] == selection.label)
+    settled = selection.select(pd.concat(best, ignore_index=True), least="speed")
+    theta = float(settled.label.removeprefix("theta="))
+    return theta, chosen[theta], settled.marked
 
 
 def deduction_jobs(cohort: Cohort, days: int, theta: float, gains: Mapping[str, float]) -> list[Job]:
@@ -163,9 +163,8 @@ def deduction_jobs(cohort: Cohort, days: int, theta: float, gains: Mapping[str, 
 def choose_deduction(runs: pd.DataFrame) -> tuple[float, pd.DataFrame]:
     """The share of a bolus taken out of the feedback; of similar ones the greatest, which gives the least insulin."""
     share = runs["label"].str.removeprefix("deduction=").astype(float)
-    selection = statistics.select(runs.assign(kept=1 - share), least="kept")
-    candidates = selection.candidates.assign(chosen=selection.candidates["label"] == selection.label)
-    return float(selection.label.removeprefix("deduction=")), candidates
+    settled = selection.select(runs.assign(kept=1 - share), least="kept")
+    return float(settled.label.removeprefix("deduction=")), settled.marked
 
 
 # ---- 2: the strategies

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pumpbench.files import write_file
-from pumpbench.study import figures, paper, statistics, tables
+from pumpbench.study import figures, paper, selection, statistics, tables
 
 PAPER_PATIENTS, PAPER_DAYS = 10, 14
 
@@ -103,8 +103,8 @@ def write_report(
         differing=list(_differing(contrasts, cells, explanations)),
         inconsistencies=_inconsistencies(),
         selections=_selections(runs),
-        tir_margin=statistics.TIR_MARGIN,
-        tbr_margin=statistics.TBR_MARGIN,
+        tir_margin=selection.TIR_MARGIN,
+        tbr_margin=selection.TBR_MARGIN,
         over_time=any(name in drawn for name in ("strategies_over_time", "ratio_6_and_10")),
         sets=sets,
         paper_tir=paper.table2().query("metric == 'tir_70_180'").set_index("mode")["mean"].to_dict(),
@@ -217,7 +217,7 @@ def _inconsistencies() -> pd.DataFrame:
 
 def _selections(runs: pd.DataFrame) -> list[dict[str, Any]]:
     rows = []
-    for name, one in tables.selections(runs).items():
+    for name, one in selection.selections(runs).items():
         published = "not stated"
         if name in paper.DOSES:
             published = f"{paper.chosen_dose(name):g} {paper.DOSES[name][2]}"

@@ -20,7 +20,7 @@ from plant_server.scenario import load_scenario
 from pumpbench import campaign
 from pumpbench.campaign import Job, Results
 from pumpbench.files import write_file
-from pumpbench.study import figures, paper, plan, report, statistics, tables
+from pumpbench.study import figures, paper, plan, report, selection, statistics, tables
 from pumpbench.study.plan import Cohort, Law
 
 Say = Callable[[str], None]
@@ -114,12 +114,12 @@ class Study:
     def _strategies(self, law: Law) -> tuple[Law, pd.DataFrame]:
         cohort, days = self._settings.cohort, self._settings.days
         thresholds = plan.detectors(self._table("thresholds of strategy 1", plan.threshold_jobs(cohort, days, law)))
-        label = tables.selections(thresholds)["s1 thresholds"].label
+        label = selection.selections(thresholds)["s1 thresholds"].label
         z1, z2, z3 = (float(number) for number in label.removeprefix("z=").split(","))
         law = dataclasses.replace(law, thresholds=(z1, z2, int(z3)))
         doses = self._table("doses and ratios", plan.dose_jobs(cohort, days, law))
         tuning = pd.concat([thresholds, doses], ignore_index=True)
-        chosen = tables.selections(tuning)
+        chosen = selection.selections(tuning)
         return dataclasses.replace(
             law, doses={mode: float(chosen[mode].label.split("=")[1]) for mode in paper.STRATEGIES}
         ), tuning

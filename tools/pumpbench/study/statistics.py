@@ -1,31 +1,22 @@
 """Paired differences between modes, as in Table 3 of Pons Torres et al. 2025, and how far they are from the paper's.
 
-The paper fits metric ~ mode + (1 | patient) with lme4 (REML) and takes differences with normal 95 % intervals. With
-every patient in every mode the fit has a closed form: differences of means, SE = sqrt(2 s2_e / n), where s2_e is the
-residual mean square, or, where the patients' variance is estimated as zero, the mean square within modes. Otherwise
-statsmodels' MixedLM is fitted. Beside it stand cluster-robust errors (ordinary least squares with a dummy per patient,
-one cluster per patient, correction n/(n - 1)): with every patient in every mode SE = sd(differences)/sqrt(n).
+The paper fits metric ~ mode + (1 | patient) with lme4 (REML) and takes differences with normal 95 % intervals; see
+`mixed_model`.
 
 The tables come as one row per run with columns part, label, patient, mode, seed and the metrics of metrics.json.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-import statsmodels.api as sm
 from scipy import stats
-from scipy.optimize import minimize_scalar
-from statsmodels.regression.mixed_linear_model import MixedLMParams
-from statsmodels.tools.sm_exceptions import ConvergenceWarning
 
 from pumpbench.study import paper
+from pumpbench.study.mixed_model import Fit, fit
 
 LEVEL: Final = 0.05
 """p below it is significant; intervals cover 1 - LEVEL."""
@@ -37,24 +28,7 @@ PAIRS: Final = tuple((comparator, strategy) for comparator in paper.COMPARATORS 
 RATIOS: Final = (6.0, 10.0)
 """ug/U that the paper compares in its discussion."""
 
-Array = np.ndarray[Any, Any]
-
 KEYS: Final = ("part", "label", "patient", "mode", "seed")
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Means per mode and two covariances of them: variances of differences are what they are good for."""
-
-    means: pd.Series
-    covariance: pd.DataFrame
-    robust: pd.DataFrame
-    patients: int
-    method: str
-    """closed form | MixedLM | least squares (MixedLM with no variance between patients) | none"""
-
-    note: str = ""
-    """Why there are no intervals, where there are none."""
 
 
 # ---------------------------------------------------------------------------------------------------------------- input
@@ -115,132 +89,6 @@ def _check_seeds(runs: pd.DataFrame) -> None:
         if sorted(set(seeds)) != wanted:
             lacking = " ".join(str(seed) for seed in wanted if seed not in set(seeds))
             raise ValueError(f"results: {patient}, {mode}: no run of seed {lacking}, which others have")
-
-
-# --------------------------------------------------------------------------------------------------------------- models
-
-
-def fit(values: pd.DataFrame, *, closed_form: bool = True) -> Fit:
-    """Mixed model and robust errors of a table patients x modes (NaN: not run).
-
-    closed_form=False fits MixedLM even where the closed form applies, to check one by the other.
-
-    Raises:
-        ValueError: the model did not converge.
-    """
-    means = values.mean()
-    empty = pd.DataFrame(np.nan, index=values.columns, columns=values.columns)
-    patients, modes = values.shape
-    none = Fit(means, empty, empty, patients, "none")
-    if patients < 2:
-        return replace(none, note="one patient: no interval")
-    if modes < 2:
-        return replace(none, note="one mode: nothing to compare")
-    if values.isna().any(axis=None):
-        return _unbalanced(values, none)
-    table = values.to_numpy(dtype=float)
-    residual = table - table.mean(axis=0) - table.mean(axis=1, keepdims=True) + table.mean()
-    if _is_nothing(np.sum(residual**2), table):
-        return replace(none, note="no variation within patients: no interval")
-    robust = values.cov() / patients
-    if not closed_form:
-        means, covariance, method = _mixed_model(values)
-        return Fit(means, covariance, robust, patients, method)
-    degrees = (patients - 1) * (modes - 1)
-    between = modes * np.sum((table.mean(axis=1) - table.mean()) ** 2)
-    variance = np.sum(residual**2) / degrees
-    if between / (patients - 1) < variance:
-        # REML would make the patients' variance negative; at its bound of zero the modes are independent samples
-        variance = (np.sum(residual**2) + between) / (degrees + patients - 1)
-    covariance = pd.DataFrame(np.eye(modes) * variance / patients, index=values.columns, columns=values.columns)
-    return Fit(means, covariance, robust, patients, "closed form")
-
-
-def _is_nothing(sum_of_squares: float, table: Array) -> bool:
-    """Rounding errors only: no more than a part in 1e12 of the values themselves."""
-    scale = max(float(np.nanmax(np.abs(table))), 1e-9)
-    return sum_of_squares <= (1e-12 * scale) ** 2 * table.size
-
-
-def _unbalanced(values: pd.DataFrame, none: Fit) -> Fit:
-    counts = values.notna().sum()
-    if (counts < 2).any():
-        few = " ".join(counts.index[counts < 2])
-        return replace(none, note=f"fewer than two patients of {few}: no interval")
-    shared = values.notna().astype(int)
-    if ((shared.T @ shared).to_numpy() == 0).any():
-        return replace(none, note="two modes without a patient in common: no interval")
-    long = _long(values)
-    design, groups = _design(long, values)
-    ordinary = sm.OLS(long["value"], design).fit()
-    if _is_nothing(float(np.sum(ordinary.resid**2)), values.to_numpy(dtype=float)):
-        return replace(none, note="no variation within patients: no interval")
-    clustered = sm.OLS(long["value"], design).fit(
-        cov_type="cluster", cov_kwds={"groups": groups, "use_correction": False}
-    )
-    modes = list(values.columns)
-    robust = clustered.cov_params().loc[modes, modes] * len(values) / (len(values) - 1)
-    means, covariance, method = _mixed_model(values)
-    return Fit(means, covariance, robust, len(values), method)
-
-
-def _long(values: pd.DataFrame) -> pd.DataFrame:
-    rows = [
-        (patient, mode, values.loc[patient, mode])
-        for patient in values.index
-        for mode in values.columns
-        if not np.isnan(values.loc[patient, mode])
-    ]
-    return pd.DataFrame(rows, columns=["patient", "mode", "value"])
-
-
-def _design(long: pd.DataFrame, values: pd.DataFrame) -> tuple[pd.DataFrame, Array]:
-    """A column per mode, one per patient but the first, and the patient's number of each row."""
-    columns = {mode: (long["mode"] == mode).astype(float) for mode in values.columns}
-    columns |= {f"patient {name}": (long["patient"] == name).astype(float) for name in values.index[1:]}
-    return pd.DataFrame(columns), pd.factorize(long["patient"])[0]
-
-
-def _mixed_model(values: pd.DataFrame) -> tuple[pd.Series, pd.DataFrame, str]:
-    """Means and their covariance of value ~ mode + (1 | patient), REML; values in units of their spread to converge."""
-    long = _long(values)
-    modes = list(values.columns)
-    centre, spread = long["value"].mean(), long["value"].std()
-    scaled = (long["value"] - centre) / spread
-    design = pd.DataFrame({mode: (long["mode"] == mode).astype(float) for mode in modes})
-    patients = pd.factorize(long["patient"])[0]
-    model = sm.MixedLM(scaled, design, groups=patients)
-    # Started from its default, the fit ends far off where the patients' variance is small, sometimes as "converged";
-    # so the one parameter that is not linear, its ratio to the residual variance, is looked for over its range first.
-    found = minimize_scalar(
-        lambda log: _reml(math.exp(log), scaled.to_numpy(), design.to_numpy(), patients), bounds=(-16, 16)
-    )
-    ratio = math.exp(found.x)
-    if ratio < 1e-5:  # REML's estimate is zero, where MixedLM cannot go: independent samples
-        result = sm.OLS(scaled, design).fit()
-        estimates, method = result.params, "least squares"
-    else:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "The MLE may be on the boundary", ConvergenceWarning)
-            start = MixedLMParams.from_components(fe_params=np.zeros(len(modes)), cov_re=np.array([[ratio]]))
-            result = model.fit(reml=True, start_params=start)
-        if not result.converged:
-            raise ValueError("mixed model: statsmodels' MixedLM did not converge")
-        estimates, method = result.fe_params, "MixedLM"
-    covariance = result.cov_params().loc[modes, modes] * spread**2
-    return estimates * spread + centre, covariance, method
-
-
-def _reml(ratio: float, value: Array, design: Array, patients: Array) -> float:
-    """-2 log REML likelihood, up to a constant, at a ratio of the patients' variance to the residual one."""
-    same = patients[:, None] == patients[None, :]
-    covariance = np.eye(len(value)) + ratio * same
-    inverse = np.linalg.inv(covariance)
-    information = design.T @ inverse @ design
-    residual = value - design @ np.linalg.solve(information, design.T @ inverse @ value)
-    degrees = len(value) - design.shape[1]
-    determinants = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
-    return float(determinants + degrees * math.log(residual @ inverse @ residual))
 
 
 # ------------------------------------------------------------------------------------------------------------ contrasts
@@ -448,97 +296,3 @@ def _ratio_runs(runs: pd.DataFrame, alone: pd.DataFrame, mode: str) -> pd.DataFr
         six, ten = six[six["seed"].isin(shared)], ten[ten["seed"].isin(shared)]
     named = [table.assign(mode=f"{mode} ratio={ratio:g}") for table, ratio in ((six, low), (ten, high)) if len(table)]
     return pd.concat(named, ignore_index=True) if named else part
-
-
-# --------------------------------------------------------------------------------------------------------------- tuning
-
-TIR_MARGIN: Final = 1.0
-"""Percent points of mean time in range within which two tunings count as similar; choice, a third of the difference
-between groups that clinicians call meaningful."""
-
-TBR_MARGIN: Final = 0.5
-"""Percent points of mean time below 70 mg/dL within which two tunings count as similar; choice, an eighth of the
-consensus limit of 4 %."""
-
-THRESHOLD_MARGIN: Final = 0.1
-"""The same for strategy 1's thresholds, which say when a dose is given, not how much: nearly only the time counts."""
-
-
-def sweeps_thresholds(tuning: pd.DataFrame) -> pd.Series:
-    """Which tuning runs belong to the search for z1, z2, z3 of strategy 1 (those with a z1)."""
-    return tuning["z1"].notna() if "z1" in tuning else pd.Series(False, index=tuning.index)
-
-
-def dose_runs(tuning: pd.DataFrame, strategy: str) -> pd.DataFrame:
-    """The tuning runs that sweep the dose or ratio of a strategy.
-
-    Raises:
-        ValueError: the dose or ratio is missing in a run.
-    """
-    part = tuning[(tuning["mode"] == strategy) & ~sweeps_thresholds(tuning)]
-    column = paper.DOSES[strategy][0]
-    if len(part):
-        check_columns(part, [column])
-        if part[column].isna().any():
-            raise ValueError(
-                f"results: tuning of {strategy}: no {column} in {part['label'][part[column].isna()].iloc[0]}"
-            )
-    return part
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The tuning chosen for a strategy, why, and all candidates with their means."""
-
-    label: str
-    why: str
-    candidates: pd.DataFrame
-    """Columns label, tir_70_180, tbr_70, tar_180, pramlintide_ug_per_day (means over patients), similar."""
-
-
-def select(
-    tuning: pd.DataFrame,
-    *,
-    tir_margin: float = TIR_MARGIN,
-    tbr_margin: float = TBR_MARGIN,
-    least: str = "pramlintide_ug_per_day",
-) -> Selection:
-    """The paper's rule on the tuning runs of one strategy, candidates told apart by `label`.
-
-    The paper takes the longest time in range with the lowest time in hypoglycaemia and, of tunings that behave
-    similarly in both, the one with the lowest daily pramlintide. Here, with means over patients (seeds averaged first):
-    keep what is within tir_margin of the longest time in range, of that keep what is within tbr_margin of the lowest
-    time below 70, of that take the lowest daily pramlintide; a tie goes to the longer time in range, then to the label
-    in order. Where no pramlintide is given, `least` names another column of what is to be as small as possible.
-
-    Raises:
-        ValueError: no runs, more than one strategy, a missing column, or a candidate that lacks a patient.
-    """
-    metrics = list(dict.fromkeys(["tir_70_180", "tbr_70", "tar_180", "pramlintide_ug_per_day", least]))
-    check_columns(tuning, ["label", "mode", "patient", "seed", *metrics])
-    modes = sorted(set(tuning["mode"]))
-    if len(modes) != 1:
-        raise ValueError(f"tuning: runs of one strategy expected, got {' '.join(modes) or 'none'}")
-    by_label = tuning.assign(mode=tuning["label"])
-    means = pd.DataFrame({metric: _whole(per_patient(by_label, metric)).mean() for metric in metrics})
-    table = means.rename_axis("label").reset_index().sort_values([least, "label"])
-    table["similar"] = table["tir_70_180"] >= table["tir_70_180"].max() - tir_margin
-    table["similar"] &= table["tbr_70"] <= table.loc[table["similar"], "tbr_70"].min() + tbr_margin
-    order = table[table["similar"]].sort_values([least, "tir_70_180", "label"], ascending=[True, False, True])
-    chosen, best = order.iloc[0], table.loc[table["tir_70_180"].idxmax()]
-    what = "pramlintide" if least == "pramlintide_ug_per_day" else least
-    why = (
-        f"{chosen['label']}: {chosen['tir_70_180']:.2f} % in range and {chosen['tbr_70']:.2f} % below 70 with "
-        f"{chosen['pramlintide_ug_per_day']:.1f} µg/day, the least {what} of {len(order)} of {len(table)} tunings "
-        f"within {tir_margin:.1f} points of the longest time in range ({best['label']}: {best['tir_70_180']:.2f} %) "
-        f"and {tbr_margin:.1f} points of the lowest time below 70 among them"
-    )
-    return Selection(str(chosen["label"]), why, table.reset_index(drop=True))
-
-
-def _whole(table: pd.DataFrame) -> pd.DataFrame:
-    lacking = table.isna().stack()
-    if lacking.any():
-        patient, label = lacking[lacking].index[0]
-        raise ValueError(f"tuning: no run of {label} for {patient}")
-    return table

@@ -5,7 +5,6 @@ Text with fixed formats, so that equal results are equal bytes, and each file is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from pumpbench.files import write_file
-from pumpbench.study import paper, statistics
+from pumpbench.study import paper, selection, statistics
 
 FURTHER: Final = ("mean_glucose", "cv", "gmi", "gri", "limiter_steps")
 """Rows of table2.csv after the paper's, where the results have these columns."""
@@ -87,7 +86,7 @@ def write_tables(folder: Path, runs: pd.DataFrame) -> list[Path]:
         "text_contrasts": statistics.text_contrasts(runs),
         "paper_inconsistencies": paper.inconsistencies(),
     }
-    chosen = selections(runs)
+    chosen = selection.selections(runs)
     if chosen:
         tables["tuning"] = pd.concat(
             [
@@ -99,14 +98,3 @@ def write_tables(folder: Path, runs: pd.DataFrame) -> list[Path]:
     for name, table in tables.items():
         write_table(folder / f"{name}.csv", table)
     return [folder / f"{name}.csv" for name in tables]
-
-
-def selections(runs: pd.DataFrame) -> Mapping[str, statistics.Selection]:
-    """What the paper's rule chooses per strategy and, as "s1 thresholds", for z1, z2, z3 of the tuning runs."""
-    tuning = runs[runs["part"] == "tuning"]
-    parts = {strategy: statistics.dose_runs(tuning, strategy) for strategy in paper.STRATEGIES}
-    chosen = {name: statistics.select(part) for name, part in parts.items() if len(part)}
-    thresholds = tuning[statistics.sweeps_thresholds(tuning)]
-    if len(thresholds):
-        chosen["s1 thresholds"] = statistics.select(thresholds, tir_margin=statistics.THRESHOLD_MARGIN)
-    return chosen
