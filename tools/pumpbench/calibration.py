@@ -4,11 +4,12 @@ This is the tool on the clinic's PC, not the pump: it may use floats. The firmwa
 index, and a CRC over the set.
 """
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from can_bus import codec
-from firmware_sim.calibration import SET_CRC_INDEX, set_crc
+from firmware_sim.calibration import SET_CRC_INDEX, parameter_names, set_crc
 from plant_server.physiology import Patient
 from pumpbench.controller_model import SAMPLE_MINUTES, ControllerModel, lags, shipped_models
 
@@ -111,9 +112,11 @@ def calibrate(patient: Patient, tuning: Tuning | None = None, model: ControllerM
         "CfgMaxRise": tuning.max_rise,
         "CfgPramTdd": tuning.pram_tdd,
         "CfgStuckSamples": tuning.stuck_samples,
-        **_coefficients(tuning, model),
+        **_coefficients(tuning.theta, model),
     }
-    return with_crc({index: _raw(name, physical[name]) for index, name in _indices().items() if name in physical})
+    return with_crc(
+        {index: _raw(name, physical[name]) for index, name in parameter_names().items() if name in physical}
+    )
 
 
 def with_crc(raws: Mapping[int, int]) -> dict[int, int]:
@@ -122,24 +125,21 @@ def with_crc(raws: Mapping[int, int]) -> dict[int, int]:
     return {**values, SET_CRC_INDEX: set_crc(values)}
 
 
-def _coefficients(tuning: Tuning, model: ControllerModel) -> dict[str, float]:
-    b0, b1, a1 = lead(model.tau_1d, tuning.theta)
-    c0, c1, _ = lead(model.tau_2d, tuning.theta)
+@functools.lru_cache(maxsize=64)  # two matrix exponentials; a campaign asks for the same few again and again
+def _coefficients(theta: float, model: ControllerModel) -> Mapping[str, float]:
+    b0, b1, a1 = lead(model.tau_1d, theta)
+    c0, c1, _ = lead(model.tau_2d, theta)
     values = {"CfgLead1B0": b0, "CfgLead1B1": b1, "CfgLead2B0": c0, "CfgLead2B1": c1, "CfgLeadA1": a1}
     matrix, inlet = lags((model.tau_1u, model.tau_1u, model.tau_2u))
     for i in range(3):
         values[f"CfgInsulinB{i + 1}"] = float(inlet[i])
         for j in range(i + 1):
             values[f"CfgInsulinA{i + 1}{j + 1}"] = float(matrix[i, j])
-    matrix, inlet = lags((tuning.theta, tuning.theta, tuning.theta))
+    matrix, inlet = lags((theta, theta, theta))
     for i in range(3):
         values[f"CfgFilterB{i + 1}"] = float(inlet[i])
         values[f"CfgFilterA{i + 1}"] = float(matrix[i, 0])
     return values
-
-
-def _indices() -> dict[int, str]:
-    return {index: fields[0].name for index, fields in codec.message("CFG_Param").pages.items()}
 
 
 def _raw(name: str, value: float) -> int:

@@ -20,6 +20,7 @@ from can_bus.codec import Check, Receiver, Transmitter
 from can_bus.faults.fields import repaired, with_raw
 from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Done, Node, Phase
+from firmware_sim.calibration import parameter_names
 from plant_server.physiology import load_patient
 from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES, calibrate, with_crc
@@ -103,12 +104,6 @@ def changed(flash: Mapping[int, int], **raws: int) -> dict[int, int]:
 def parameter_index(name: str) -> int:
     """CfgIndex of a parameter."""
     return next(index for index, known in parameter_names().items() if known == name)
-
-
-@functools.cache
-def parameter_names() -> dict[int, str]:
-    """CfgIndex -> the signal that holds the value."""
-    return {index: fields[0].name for index, fields in codec.message("CFG_Param").pages.items()}
 
 
 @dataclass
@@ -256,7 +251,8 @@ class Bench:
         for frame in frames:
             self.log.append(frame)
             said = self.firmware.receive(frame)
-            expect(not said, f"silence out of turn; after {frame_text(frame)} came {_texts(said)}")
+            if said:
+                raise Violation(f"silence out of turn; after {frame_text(frame)} came {_texts(said)}")
 
     def reboot(self, said: Sequence[Frame]) -> None:
         """The device was started anew and has said this: its counters begin again."""
@@ -291,8 +287,9 @@ class Bench:
         turn = Turn(list(frames))
         for frame in frames:
             check, name, values, _ = self.receiver.receive(frame)
-            wrong = "is not a frame of CTRL" if check == Check.UNKNOWN else f"fails: {check.name}"
-            expect(check == Check.OK, f"frames of CTRL with good CRC and the next counter; {frame_text(frame)} {wrong}")
+            if check != Check.OK:
+                wrong = "is not a frame of CTRL" if check == Check.UNKNOWN else f"fails: {check.name}"
+                raise Violation(f"frames of CTRL with good CRC and the next counter; {frame_text(frame)} {wrong}")
             turn.said.append((name, values))
         self.log += frames
         return turn
@@ -326,8 +323,9 @@ class Bench:
 
     def configure(self, flash: dict[int, int], mode: int | None = None) -> Turn:
         """Flash parameters, ask for a mode, and give the turn for it."""
+        names = parameter_names()
         for index, raw in flash.items():
-            self.send("CFG_Param", CfgIndex=index, **{parameter_names()[index]: raw})
+            self.send("CFG_Param", CfgIndex=index, **{names[index]: raw})
         if mode is not None:
             self.request(0, 0, mode)
         turn = self.token(Phase.CONFIG, 0)

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from typing import Final
 
+from firmware_sim.calibration import parameter_names
 from pumpbench.calibration import with_crc
 from pumpbench.conformance.boluses import COMMIT, PROGRAM, bolus_steps, meal_mode
-from pumpbench.conformance.driver import HIGH, Bench, Turn, calibration, expect, parameter_names
+from pumpbench.conformance.driver import HIGH, Bench, Turn, calibration, expect
 from pumpbench.conformance.registry import Dut, check
 
 TEN: Final = range(10)

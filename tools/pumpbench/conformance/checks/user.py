@@ -6,6 +6,7 @@ from typing import Final
 from can_bus import codec
 from can_bus.frame import Frame
 from can_bus.lockstep import Phase
+from firmware_sim.calibration import parameter_names
 from pumpbench.calibration import MODES, with_crc
 from pumpbench.conformance.boluses import ACK_OF, COMMIT, INSULIN, PROGRAM, PowerCut, carbs_mode, meal_mode
 from pumpbench.conformance.driver import (
@@ -17,7 +18,6 @@ from pumpbench.conformance.driver import (
     Turn,
     calibration,
     expect,
-    parameter_names,
 )
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, NotOffered, check
