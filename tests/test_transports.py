@@ -168,7 +168,7 @@ class Node:
     def result(self) -> Any:
         end = time.monotonic() + LIMIT
         while not self._pipe.poll(0 if self._rig.hub else 0.1):
-            assert time.monotonic() < end, "a node did not come to an end"
+            assert time.monotonic() < end, f"a node did not come to an end: {self.whereabouts()}"
             if self._rig.hub is not None:
                 self._rig.hub.poll(0.01)
         kind, value = self._pipe.recv()
@@ -189,9 +189,19 @@ class Node:
         self.wait_for_stop()
 
     def wait_for_stop(self) -> None:
-        status = Path(f"/proc/{self.pid}/stat")
-        while status.read_text().rpartition(")")[2].split()[0] != "T":
+        end = time.monotonic() + LIMIT
+        while self._state() != "T":
+            assert time.monotonic() < end, f"a node does not stop: {self.whereabouts()}"
             time.sleep(0.001)
+
+    def _state(self) -> str:
+        return Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+    def whereabouts(self) -> str:
+        """What the kernel says of it, and of frames that it has lost before any socket (second number)."""
+        waits = Path(f"/proc/{self.pid}/wchan").read_text()
+        lost = Path("/proc/net/softnet_stat").read_text().splitlines()
+        return f"state {self._state()}, waits in {waits}, backlogs {[each.split()[:3] for each in lost]}"
 
     def end(self) -> None:
         with contextlib.suppress(OSError):
@@ -205,7 +215,7 @@ class Node:
             self._worker.join(2)
             if self._worker.is_alive():
                 self._worker.kill()
-            self._worker.join()
+            self._worker.join(LIMIT)
             self._worker.close()
         self._pipe.close()
 
