@@ -20,9 +20,10 @@ from can_bus.process import exit_status
 from can_bus.url import open_link
 
 from .console import Console, FirmwareView
-from .firmware import NVM_BYTES, Cause, Firmware, own_messages, subscriptions
+from .firmware import NVM_BYTES, Cause, Firmware
 from .nvm import FileMemory, NvmError
 from .serial_port import PortError, SerialPort
+from .wire import own_messages, subscriptions
 
 POLL_SECONDS = 0.05
 

@@ -62,6 +62,9 @@ PRIORITY = {
 STEPS_AT_LEAST = 6
 """Steps an alarm lasts however soon its cause ends, so that a flapping cause raises one alarm in 30 min (FAL-03)."""
 
+ALARM_HOLD = 3
+"""Quiet steps after which the cause of an alarm that tells of a passing event ends (project's choice)."""
+
 STEPS_CONFIRMED = 6
 STEPS_CONFIRMED_OF = {Code.STATE_CHANGE: 3}
 """Steps after which an alarm that was confirmed or snoozed is pending again if its cause still holds (ALM-04)."""
@@ -86,6 +89,8 @@ class Alarms:
     def __init__(self) -> None:
         self._active: dict[Code, _Alarm] = {}
         self._next_instance = 0
+        self._event_steps: dict[Code, int] = {}  # of the newest event that this alarm tells of
+        self._totals: dict[Code, int] = {}  # of such events that are counted
         self._seen = 0  # bit per code: raised since boot
         self._kept = 0  # bit per code: raised since the history was cleared, over resets
 
@@ -97,6 +102,20 @@ class Alarms:
     def bits(self) -> int:
         """Those in force, confirmed or not: a bit per code."""
         return sum(1 << code for code in self._active)
+
+    def event(self, code: Code, step: int) -> None:
+        """Something happened in this step that the alarm tells of, and may be over with it."""
+        self._event_steps[code] = step
+
+    def count(self, code: Code, total: int, step: int) -> None:
+        """Such events as somebody else counts: how many there were so far."""
+        if total > self._totals.get(code, 0):
+            self._totals[code] = total
+            self.event(code, step)
+
+    def recent(self, code: Code, step: int) -> bool:
+        """Whether such an event is a cause to hold the alarm: the last one was less than `ALARM_HOLD` steps ago."""
+        return code in self._event_steps and step - self._event_steps[code] < ALARM_HOLD
 
     def hold(self, code: Code, cause: bool, aux: int) -> None:
         """Raise the alarm if its cause holds, end it if not; `aux` (16 bit) tells more and may change.

@@ -8,8 +8,8 @@ request, where the standard says five seconds.
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from .alarms import Code
-from .history import STEPS
+from .alarms import Alarms, Code
+from .history import STEPS, History, pack
 
 POSITIVE = 0x40
 NEGATIVE = 0x7F
@@ -65,15 +65,6 @@ class Device(Protocol):
     def identification(self) -> Mapping[int, bytes]:
         """Data by identifier."""
 
-    def history_at(self, place: int) -> bytes:
-        """The record in a place of the history; empty where there is none."""
-
-    def dtc_status(self, code: Code) -> int:
-        """Status byte of an alarm's DTC."""
-
-    def clear_dtcs(self, codes: tuple[Code, ...]) -> None:
-        """Forget what is remembered of these; what is in force stays in force."""
-
     def may_restart(self) -> bool:
         """Whether nothing is under way that a restart would make uncertain."""
 
@@ -96,8 +87,10 @@ class _Refused(Exception):
 class Uds:
     """Answers requests, one after the other."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device, alarms: Alarms, history: History) -> None:
         self._device = device
+        self._alarms = alarms
+        self._history = history
         self._session = DEFAULT
         self._heard = False  # a request came in this step
         self._result: int | None = None  # of the last self test
@@ -163,19 +156,25 @@ class Uds:
         codes = tuple(code for code in Code if group in (ALL_DTCS, dtc(code)))
         if not codes:
             raise _Refused(OUT_OF_RANGE)
-        self._device.clear_dtcs(codes)
+        for code in codes:
+            self._alarms.clear(code)
         return b""
 
     def _on_read_dtc(self, data: bytes) -> bytes:
         supported = bool(data) and data[0] & ~SUPPRESS == SUPPORTED
         subfunction = self._subfunction(data, 1 if supported else 2, (BY_MASK_COUNT, BY_MASK, SUPPORTED))
-        found = [(dtc(code), self._device.dtc_status(code)) for code in Code]
+        found = [(dtc(code), self._dtc_status(code)) for code in Code]
         if not supported:
             found = [(number, status) for number, status in found if status & data[1] & AVAILABLE]
         if subfunction == BY_MASK_COUNT:
             return bytes([subfunction, AVAILABLE, FORMAT_ISO_14229]) + len(found).to_bytes(2, "big")
         listed = b"".join(number.to_bytes(3, "big") + bytes([status]) for number, status in found)
         return bytes([subfunction, AVAILABLE]) + listed
+
+    def _dtc_status(self, code: Code) -> int:
+        in_force, since_boot, since_clear = self._alarms.history(code)
+        kept = CONFIRMED | FAILED_SINCE_CLEAR if since_clear else 0
+        return (FAILED if in_force else 0) | (FAILED_THIS_CYCLE if since_boot else 0) | kept
 
     def _on_read_data(self, data: bytes) -> bytes:
         if not data or len(data) % 2 or len(data) > 2 * DIDS_AT_MOST:
@@ -185,11 +184,16 @@ class Uds:
         for name in (data[i : i + 2] for i in range(0, len(data), 2)):
             number = int.from_bytes(name, "big")
             in_history = HISTORY_DID <= number < HISTORY_DID + STEPS
-            value = self._device.history_at(number - HISTORY_DID) if in_history else known.get(number, b"")
+            value = self._record(number - HISTORY_DID) if in_history else known.get(number, b"")
             found += name + value if value else b""
         if not found:
             raise _Refused(OUT_OF_RANGE)
         return found
+
+    def _record(self, place: int) -> bytes:
+        """The packed record in a place of the history; empty where there is none."""
+        record = self._history.at(place)
+        return b"" if record is None else pack(record)
 
     def _on_routine(self, data: bytes) -> bytes:
         self._need_extended()

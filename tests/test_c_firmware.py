@@ -21,8 +21,9 @@ from can_bus.codec import Transmitter, message, protect
 from can_bus.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, Frame, pack, unpack
 from can_bus.lockstep import Phase
 from firmware_sim.calibration import LOWEST, NEEDED, SET_CRC_INDEX, UNSET, set_crc
-from firmware_sim.firmware import CYCLIC, Firmware, own_messages, subscriptions
+from firmware_sim.firmware import Firmware
 from firmware_sim.ladder import State
+from firmware_sim.wire import CYCLIC, own_messages, subscriptions
 
 SOURCE = ROOT / "examples" / "c_firmware"
 VECTOR = ROOT / "examples" / "golden_vectors" / "nma.log"

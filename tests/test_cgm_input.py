@@ -12,9 +12,10 @@ from can_bus.lockstep import STEP_SECONDS, Phase
 from firmware_sim.alarms import Code
 from firmware_sim.cgm import ABOVE_RANGE_ACTS_AS, AGE_USABLE, BELOW_RANGE_ACTS_AS, SEQUENCE_MODULUS, Cgm
 from firmware_sim.control.layout import LIMITER_LOW_GLUCOSE
-from firmware_sim.firmware import DIAGNOSTICS, Firmware, subscriptions
+from firmware_sim.firmware import Firmware
 from firmware_sim.ladder import State
 from firmware_sim.pump import Op
+from firmware_sim.wire import DIAGNOSTICS, subscriptions
 
 OK, BELOW, ABOVE = 1, 4, 5
 USABLE_RAW = range(200, 8001)

@@ -233,7 +233,8 @@ def test_a_bolus_into_a_blocked_line(monkeypatch: Patch) -> None:
     control = Firmware._control
 
     def careless(self: Firmware, *how: int) -> None:
-        blocked, self._pump.insulin_blocked = self._pump.insulin_blocked, self._pump.insulin_blocked and self._mode == 6
+        blocked = self._pump.insulin_blocked
+        self._pump.insulin_blocked = blocked and self._user.mode == 6
         control(self, *how)  # type: ignore[arg-type]
         self._pump.insulin_blocked = blocked
 

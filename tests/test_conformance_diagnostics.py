@@ -26,7 +26,7 @@ def lifts_a_limit(device: Firmware) -> None:
 
 
 def doses(device: Firmware) -> None:
-    device._on_meal_announce({"MealKind": 1, "MealId": 3, "CarbsEst": 50, "MealOffset": 0})
+    device._meals.hear({"MealKind": 1, "MealId": 3, "CarbsEst": 50, "MealOffset": 0})
 
 
 @pytest.mark.parametrize("service", [0x14, 0x2E, 0x2F, 0x31, 0x3D])
@@ -73,7 +73,7 @@ def no_boluses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def short_records(monkeypatch: pytest.MonkeyPatch) -> None:
     as_it_is = history.pack
-    monkeypatch.setattr("firmware_sim.firmware.pack", lambda record: as_it_is(record)[:-1])
+    monkeypatch.setattr("firmware_sim.uds.pack", lambda record: as_it_is(record)[:-1])
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,10 @@ from pumpbench.conformance.suite import select
 from can_bus import codec
 from can_bus.faults.fields import repaired
 from can_bus.frame import CAN_SFF_MASK, Frame
-from firmware_sim import e2e_window, ladder
+from firmware_sim import e2e_window, ladder, wire
 from firmware_sim.cgm import Cgm
 from firmware_sim.firmware import Firmware
+from firmware_sim.wire import Wire
 
 
 @pytest.mark.parametrize("requirement", [each.id for each in select(["E2E"])])
@@ -55,7 +56,7 @@ def test_errors_that_nobody_counts() -> None:
 
 
 def test_an_error_that_does_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Firmware, "_stale_age", lambda self: 4 if self._e2e_errors() == 0 else 0)
+    monkeypatch.setattr(Firmware, "_stale_age", lambda self: 4 if self._wire.e2e_errors == 0 else 0)
     expect_failed("E2E-01", "to change nothing in step")
 
 
@@ -68,7 +69,7 @@ def test_counter_steps(monkeypatch: pytest.MonkeyPatch, most: int, text: str) ->
 
 
 def test_lost_frames_that_nobody_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Firmware, "_lost_frames", lambda _: 0)
+    monkeypatch.setattr(Wire, "lost_frames", 0)
     expect_failed("E2E-02", "LostFrameCount to grow by 1 with")
 
 
@@ -98,18 +99,12 @@ def test_windows_for_more_or_fewer_errors(monkeypatch: pytest.MonkeyPatch, most:
 
 
 def test_a_message_without_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    as_it_is = Firmware._boot
-
-    def boot(self: Firmware) -> None:
-        as_it_is(self)
-        self._windows["PUMP_Delivered"].close = lambda: True  # type: ignore[method-assign]
-
-    monkeypatch.setattr(Firmware, "_boot", boot)
+    monkeypatch.setattr(wire, "CYCLIC", ("CGM_Reading", "PUMP_Status"))
     expect_failed("E2E-03", "PUMP_Delivered with 3 U more, good frame 1 after 2 wrong ones in a row, is not used")
 
 
 def test_sixteen_lost_that_nobody_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Firmware, "_lost_frames", lambda self: self._receiver.lost)
+    monkeypatch.setattr(Wire, "lost_frames", property(lambda self: self._receiver.lost))
     expect_failed("E2E-04", "LostFrameCount to grow by 16")
 
 
@@ -137,19 +132,12 @@ def test_masquerade_by_checksum() -> None:
 
 
 def test_masquerade_that_nobody_tells_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Firmware, "_e2e_errors", lambda self: self._receiver.crc_errors + self._receiver.malformed)
+    monkeypatch.setattr(Wire, "e2e_errors", property(lambda self: self._receiver.crc_errors + self._receiver.malformed))
     expect_failed("E2E-05", "the alarm E2EFault for a SYNC_Done")
 
 
 def test_boluses_beside_an_impostor(monkeypatch: pytest.MonkeyPatch) -> None:
-    as_it_is = Firmware._count_inputs
-
-    def forgetful(self: Firmware) -> int:
-        work = as_it_is(self)
-        self._last_impostor = -99
-        return work
-
-    monkeypatch.setattr(Firmware, "_count_inputs", forgetful)
+    monkeypatch.setattr(Wire, "alone", lambda *_: True)
     expect_failed("E2E-05", "no bolus in the step in which somebody else")
 
 
@@ -159,7 +147,7 @@ def test_malformed_frames(hears: object, text: str) -> None:
 
 
 def test_malformed_frames_that_nobody_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Firmware, "_e2e_errors", lambda self: self._receiver.crc_errors)
+    monkeypatch.setattr(Wire, "e2e_errors", property(lambda self: self._receiver.crc_errors))
     expect_failed("E2E-06", "E2eErrorCount to count frames of another length or kind")
 
 
@@ -174,13 +162,8 @@ def test_silence(monkeypatch: pytest.MonkeyPatch, limit: int, text: str) -> None
 
 @pytest.mark.parametrize("name", ["HB_PUMP", "HB_CGM"])
 def test_a_heartbeat_that_nobody_misses(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    as_it_is = Firmware._boot
-
-    def boot(self: Firmware) -> None:
-        as_it_is(self)
-        self._handlers[name] = lambda _: None
-
-    monkeypatch.setattr(Firmware, "_boot", boot)
+    as_it_is = Wire.silence
+    monkeypatch.setattr(Wire, "silence", lambda self, of, step: 0 if of == name else as_it_is(self, of, step))
     expect_failed("E2E-07", f"another state than Auto 4 steps after the last {name}")
 
 

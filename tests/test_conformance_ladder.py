@@ -219,7 +219,7 @@ def test_suspending_stops_nothing(monkeypatch: Patch) -> None:
 
 def test_suspended_ends_by_itself(monkeypatch: Patch) -> None:
     def impatient(self: Firmware) -> int:
-        self._suspended = self._suspended and self._now < 20
+        self._user.suspended = self._user.suspended and self._now < 20
         return run(self)
 
     run = Firmware._task_ladder

@@ -13,7 +13,7 @@ from firmware_sim.alarms import Alarms, Code
 from firmware_sim.calibration import Calibration
 from firmware_sim.control import core, layout, limits
 from firmware_sim.day import Day
-from firmware_sim.firmware import Firmware
+from firmware_sim.delivery import Delivery
 from firmware_sim.pump import Op
 from firmware_sim.pump import Pump as PumpSeen
 from firmware_sim.selftest import Failure
@@ -124,9 +124,9 @@ def test_a_low_that_is_not_foreseen_by_a_law_that_asks_for_more(monkeypatch: pyt
 # ---- LIM-06
 
 
-@pytest.mark.parametrize(("left", "text"), [("_insulin_left", "6000 mU"), ("_pram_left", "1000 ug of pramlintide")])
+@pytest.mark.parametrize(("left", "text"), [("insulin_left", "6000 mU"), ("pram_left", "1000 ug of pramlintide")])
 def test_a_day_without_end(monkeypatch: pytest.MonkeyPatch, left: str, text: str) -> None:
-    monkeypatch.setattr(Firmware, left, lambda _: 1 << 24)
+    monkeypatch.setattr(Delivery, left, lambda *_: 1 << 24)
     expect_failed("LIM-06", text)
 
 

@@ -9,7 +9,7 @@ from pumpbench.conformance.device import InProcess
 from pumpbench.conformance.suite import select
 
 from can_bus.faults.nodes import MemoryState
-from firmware_sim import firmware
+from firmware_sim import alarms, caution
 from firmware_sim.alarms import Alarms
 from firmware_sim.bolus import Boluses, Op, Phase
 from firmware_sim.calibration import Calibration
@@ -17,6 +17,7 @@ from firmware_sim.cgm import Cgm
 from firmware_sim.firmware import NVM_BYTES, Firmware
 from firmware_sim.nvm import ERASED, RamMemory
 from firmware_sim.pump import Pump
+from firmware_sim.user import User
 
 MAX_BASAL = 3
 """CfgIndex of CfgMaxBasal."""
@@ -66,12 +67,22 @@ def hasty(device: Firmware) -> None:
     device._boluses._open.clear()
 
 
+def open_loop(device: Firmware) -> None:
+    """It goes on in another mode."""
+    device._user.mode = 2
+
+
+def on_hold(device: Firmware) -> None:
+    """It goes on as after too many resets."""
+    device._caution.held = True
+
+
 @pytest.mark.parametrize(
     ("part", "restore", "what", "text"),
     [
         (Firmware, "_restore", no_insulin, "at least 364 of insulin on board"),
-        (Firmware, "_restore", sets(_mode=2), "CtrlMode 6 as before the power was cut; 2 came"),
-        (Firmware, "_restore", sets(_suspended=False), "CtrlState SUSPENDED after a restart"),
+        (User, "restore", sets(mode=2), "CtrlMode 6 as before the power was cut; 2 came"),
+        (User, "restore", sets(suspended=False), "CtrlState SUSPENDED after a restart"),
         (Pump, "restore", sets(_sequence=1022), "a BasalCmdSeq that goes on from"),
         (Cgm, "restore", sets(_sequence=None), "a sample that was used before the power was cut is not used"),
         (Calibration, "restore", no_limit, "at most CfgMaxBasal"),
@@ -111,8 +122,8 @@ def remembering(erased_by: tuple[MemoryState, ...], after: Callable[[Firmware], 
     [
         (lambda: remembering(("torn",)), "CtrlMode of at most one step ago after a torn write"),
         (remembering, "no bolus by a device that has lost its memory"),
-        (lambda: remembering((), sets(_mode=2)), "at most the schedule of 285 by a device that has lost its memory"),
-        (lambda: remembering((), sets(_held=True)), "CfgMaxIob on board by a device that knows of none"),
+        (lambda: remembering((), open_loop), "at most the schedule of 285 by a device that has lost its memory"),
+        (lambda: remembering((), on_hold), "CfgMaxIob on board by a device that knows of none"),
     ],
 )
 def test_a_damaged_memory(device: Callable[..., InProcess], text: str) -> None:
@@ -124,7 +135,7 @@ def test_a_damaged_memory_that_nobody_is_told_of() -> None:
         return values | {"InsulinOnBoard": 4000} if name == "CTRL_Status" else values
 
     device = Changed(says=full)
-    device._device = remembering((), sets(_held=True))
+    device._device = remembering((), on_hold)
     expect_failed("RST-02", "the alarm SelfTest by a device that has lost its memory", device)
 
 
@@ -165,7 +176,7 @@ def test_resets_that_are_not_told(fields: Values, text: str) -> None:
 
 
 def test_resets_without_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(firmware, "ALARM_HOLD", 0)
+    monkeypatch.setattr(alarms, "ALARM_HOLD", 0)
     expect_failed("RST-04", "the alarm NodeReset in the step after a start")
 
 
@@ -174,7 +185,7 @@ def test_resets_without_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
     [(4, "CtrlState AUTO 15 steps after 4 resets"), (6, "CtrlState SAFE_BASAL 0 steps after 5 resets")],
 )
 def test_too_many_resets(monkeypatch: pytest.MonkeyPatch, resets: int, text: str) -> None:
-    monkeypatch.setattr(firmware, "RESETS_KEPT", resets)
+    monkeypatch.setattr(caution, "RESETS_KEPT", resets)
     expect_failed("RST-04", text)
 
 

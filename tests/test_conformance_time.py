@@ -9,8 +9,8 @@ from pumpbench.conformance.suite import select
 
 from can_bus import codec
 from can_bus.frame import Frame
-from can_bus.lockstep import Phase
-from firmware_sim import cgm, firmware, pump
+from can_bus.lockstep import STEP_SECONDS, Phase
+from firmware_sim import caution, cgm, pump
 from firmware_sim.cgm import Cgm
 from firmware_sim.firmware import Firmware
 from firmware_sim.ladder import Ladder
@@ -41,7 +41,7 @@ def test_a_repeated_step_that_leaves_a_trace(monkeypatch: pytest.MonkeyPatch) ->
     def forgetful(self: Firmware, values: Values) -> list[Frame]:
         if self._step is not None and values["StepIndex"] < self._step:
             self._cgm.since_gap = self._state[0] = 0
-            self._suspended = True
+            self._user.suspended = True
         return as_it_is(self, values)
 
     monkeypatch.setattr(Firmware, "_on_token", forgetful)
@@ -80,24 +80,24 @@ def test_expiry(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     ],
 )
 def test_clock_jumps(monkeypatch: pytest.MonkeyPatch, name: str, value: int, text: str) -> None:
-    monkeypatch.setattr(firmware, name, value)
+    monkeypatch.setattr(caution, name, value)
     expect_failed("TIM-03", text)
 
 
 def beside_a_jump(monkeypatch: pytest.MonkeyPatch, what: Any) -> None:
     """A device that does something more when the clock jumps."""
-    as_it_is = Firmware._check_clock
+    as_it_is = Firmware._run_step
 
-    def check(self: Firmware, step: int, sim_time: int) -> None:
-        as_it_is(self, step, sim_time)
-        if self._last_jump == step:
+    def run_step(self: Firmware, step: int, sim_time: int) -> None:
+        if abs(sim_time - step * STEP_SECONDS) > caution.CLOCK_TOLERANCE:
             what(self)
+        as_it_is(self, step, sim_time)
 
-    monkeypatch.setattr(Firmware, "_check_clock", check)
+    monkeypatch.setattr(Firmware, "_run_step", run_step)
 
 
 def test_a_clock_that_ages_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    beside_a_jump(monkeypatch, lambda device: device._samples.clear())
+    beside_a_jump(monkeypatch, lambda device: device._wire._batch["CGM_Reading"].clear())
     expect_failed("TIM-03", "with a clock 61 s off")
 
 
@@ -108,7 +108,7 @@ def test_a_clock_that_forgets_a_bolus(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_clock_that_makes_a_bolus_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
     def in_doubt(device: Firmware) -> None:
-        device._boluses._states.clear()
+        device._wire._batch["PUMP_BolusState"].clear()
         for bolus in device._boluses._open.values():
             bolus.uncertain = True
 

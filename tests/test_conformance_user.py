@@ -9,7 +9,7 @@ from pumpbench.conformance.suite import select
 from test_conformance_numbers import of
 from test_conformance_reset import forget, hasty
 
-from firmware_sim import calibration, firmware, ladder, meals
+from firmware_sim import calibration, ladder, meals, user
 from firmware_sim.bolus import Boluses, Op
 from firmware_sim.firmware import Firmware
 from firmware_sim.meals import Meals
@@ -91,7 +91,7 @@ def test_an_answer_that_comes_after_the_cancel(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_modes_that_nobody_knows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(firmware, "SUPPORTED_MODES", tuple(range(16)))
+    monkeypatch.setattr(user, "SUPPORTED_MODES", tuple(range(16)))
     expect_failed("USR-04", "CtrlMode [8] after ModeRequest 9; 9 came")
 
 
@@ -107,7 +107,7 @@ def test_a_suspension_by_an_old_command(monkeypatch: pytest.MonkeyPatch) -> None
     as_it_is = Firmware._on_mode_cmd
 
     def careless(self: Firmware, values: Values) -> None:
-        self._suspended = values["SuspendRequest"] == 1
+        self._user.suspended = values["SuspendRequest"] == 1
         as_it_is(self, values)
 
     monkeypatch.setattr(Firmware, "_on_mode_cmd", careless)
@@ -124,7 +124,7 @@ def test_a_mode_that_doses(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def generous(self: Firmware, values: Values) -> None:
         as_it_is(self, values)
-        self._on_meal_announce({"MealKind": 1, "MealId": values["ModeCmdSeq"], "CarbsEst": 50, "MealOffset": 0})
+        self._meals.hear({"MealKind": 1, "MealId": values["ModeCmdSeq"], "CarbsEst": 50, "MealOffset": 0})
 
     monkeypatch.setattr(Firmware, "_on_mode_cmd", generous)
     expect_failed("USR-04", "no bolus for ModeRequest 3")

@@ -15,7 +15,7 @@ from pumpbench.conformance.reference import reference
 from pumpbench.conformance.requirements import requirements
 from pumpbench.conformance.suite import Report, Verdict
 
-import firmware_sim.firmware
+import firmware_sim.wire
 from can_bus import codec
 from can_bus.codec import Check, Received, Receiver
 from can_bus.faults.fields import repaired
@@ -79,7 +79,7 @@ class Trusting(Receiver):
 
 def with_receiver(kind: type[Receiver]) -> Callable[[Patch], Device]:
     def make(patch: Patch) -> Device:
-        patch.setattr(firmware_sim.firmware, "Receiver", kind)
+        patch.setattr(firmware_sim.wire, "Receiver", kind)
         return reference()
 
     return make

@@ -30,7 +30,7 @@ import plant_server.pump
 import plant_server.sensor
 import plant_server.set_point
 from can_bus import codec, faults, lockstep
-from firmware_sim import firmware
+from firmware_sim import firmware, user
 from firmware_sim.control import core, layout
 
 MESSAGES = sorted(dbc.load().messages, key=lambda message: message.frame_id)
@@ -397,7 +397,7 @@ def test_modes() -> None:
             assert plain(modes[code]) == short or plain(modes[code]).startswith((f"insulin{short}", f"pram{short}"))
     for name, code in MODES.items():
         assert getattr(core, f"MODE_{name.upper()}") == code
-    assert set(firmware.SUPPORTED_MODES) <= set(modes)
+    assert set(user.SUPPORTED_MODES) <= set(modes)
 
 
 def test_limiter_bits() -> None:

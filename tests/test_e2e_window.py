@@ -12,9 +12,10 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Phase
 from firmware_sim.alarms import Code
 from firmware_sim.e2e_window import E2eWindow, Validity
-from firmware_sim.firmware import CYCLIC, NVM_BYTES, Firmware
+from firmware_sim.firmware import NVM_BYTES, Firmware
 from firmware_sim.ladder import State
 from firmware_sim.nvm import RamMemory
+from firmware_sim.wire import CYCLIC
 
 CHECKS = {
     "g": (Check.OK,),
@@ -153,7 +154,7 @@ def test_totals_that_are_not_valid_are_made_up_for_later() -> None:
     disturb(undisturbed, "PUMP_Delivered", "gggggg", 2000)
     for each in (bench, undisturbed):
         each.run(40)
-    assert bench.firmware._insulin_day.total == pytest.approx(bench.total // 12, abs=bench.basal)  # type: ignore[attr-defined]
+    assert bench.firmware._delivery.insulin_day.total == pytest.approx(bench.total // 12, abs=bench.basal)  # type: ignore[attr-defined]
 
 
 def test_what_the_pump_says_while_it_is_not_valid_is_not_believed() -> None:
@@ -174,9 +175,9 @@ def test_a_reset_begins_without_data() -> None:
     bench = Bench(mode=S2, firmware=Firmware(memory))
     bench.run(5)
     disturb(bench, "CGM_Reading", "gcc")
-    windows = bench.firmware._windows  # type: ignore[attr-defined]
+    windows = bench.firmware._wire._windows  # type: ignore[attr-defined]
     assert [windows[name].state for name in CYCLIC] == [Validity.INVALID, Validity.VALID, Validity.VALID]
-    assert {window.state for window in Firmware(memory)._windows.values()} == {Validity.NO_DATA}
+    assert {window.state for window in Firmware(memory)._wire._windows.values()} == {Validity.NO_DATA}
 
 
 # ---- bursts on the bus

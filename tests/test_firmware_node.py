@@ -15,9 +15,11 @@ from can_bus.frame import Frame
 from can_bus.lockstep import Done, Phase
 from firmware_sim.alarms import PRIORITY, STEPS_AT_LEAST, Code, Priority
 from firmware_sim.alarms import State as AlarmState
-from firmware_sim.firmware import SUPPORTED_MODES, VERSION, Firmware, subscriptions
+from firmware_sim.firmware import VERSION, Firmware
 from firmware_sim.ladder import State
 from firmware_sim.pump import RATE_EXPIRES_AFTER, Op, Pump
+from firmware_sim.user import SUPPORTED_MODES
+from firmware_sim.wire import subscriptions
 
 STEP_FRAMES = ["PUMP_BasalCmd", "CTRL_Status", "CTRL_Diag", "HB_CTRL", "SYNC_Done"]
 """What an uneventful step is answered with, in this order."""

@@ -10,9 +10,10 @@ import dbc
 from can_bus.lockstep import STEP_SECONDS
 from firmware_sim import heartbeat
 from firmware_sim.alarms import Code
-from firmware_sim.firmware import Firmware, subscriptions
+from firmware_sim.firmware import Firmware
 from firmware_sim.heartbeat import Heartbeat
 from firmware_sim.ladder import PUMP_SILENT, Ladder, State
+from firmware_sim.wire import subscriptions
 
 TOGGLE = {"HB_PUMP": "TogglePump", "HB_CGM": "ToggleCgm"}
 NODES = {"HB_PUMP": (State.DELIVERY_UNCERTAIN, Code.PUMP_LOST), "HB_CGM": (State.DEGRADED, Code.CGM_LOST)}
@@ -106,7 +107,7 @@ def test_a_device_that_never_heard_one_misses_none() -> None:
 
 
 def test_a_reset_forgets_them_like_everything_that_was_heard() -> None:
-    assert Firmware()._pump_heartbeat.silence(100) == 0
+    assert Firmware()._wire.silence("HB_PUMP", 100) == 0
 
 
 def test_the_first_samples_do_not_lead_to_auto_while_the_sensor_is_silent() -> None:

@@ -18,7 +18,8 @@ from can_bus import codec
 from can_bus.codec import MessageCodec, Transmitter
 from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Done, Phase
-from firmware_sim.firmware import Firmware, subscriptions
+from firmware_sim.firmware import Firmware
+from firmware_sim.wire import subscriptions
 
 SEQUENCES = int(os.environ.get("PUMPBENCH_SEQUENCES", "60"))
 RANDOM_FRAMES = int(os.environ.get("PUMPBENCH_RANDOM_FRAMES", "20000"))
@@ -171,7 +172,7 @@ def test_random_frames_change_no_dose_and_break_nothing() -> None:
             quiet.step(1400 + number // 100 % 7), noisy.step(1400 + number // 100 % 7)
     assert noisy.firmware._outputs == quiet.firmware._outputs
     assert noisy.firmware._state == quiet.firmware._state
-    assert noisy.firmware._receiver.crc_errors > 0
+    assert noisy.firmware._wire.e2e_errors > 0
 
 
 @pytest.mark.parametrize("first", range(0, SEQUENCES, 20))

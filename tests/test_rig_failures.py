@@ -36,13 +36,14 @@ while True:
 DIES = {
     "killed": ("import os; os.kill(os.getpid(), 9)", "the firmware was killed by SIGKILL"),
     "hangs": ("import time; time.sleep(60)", "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
-    "wrong step": ("link.send([firmware._transmitter.frame('SYNC_Done', DoneStatus=0, DoneStepIndex=7)]); continue",
-                   "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
+    "wrong step": (
+        "link.send([firmware._turn.transmitter.frame('SYNC_Done', DoneStatus=0, DoneStepIndex=7)]); continue",
+        "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
     "talks on and on": (
-        "[(link.send([firmware._transmitter.frame('CTRL_Diag')] * 10), time.sleep(0.001)) for _ in iter(int, 1)]",
+        "[(link.send([firmware._turn.transmitter.frame('CTRL_Diag')] * 10), time.sleep(0.001)) for _ in iter(int, 1)]",
         "waited 2 s for CTRL to answer step 20 with SYNC_Done"),
     "asks for turns for ever": (
-        "link.send([firmware._transmitter.frame('SYNC_Done', DoneStatus=3, DoneStepIndex=20)]); continue",
+        "link.send([firmware._turn.transmitter.frame('SYNC_Done', DoneStatus=3, DoneStepIndex=20)]); continue",
         "asked for more than 32 turns in step 20"),
 }  # fmt: skip
 

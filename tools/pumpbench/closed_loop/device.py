@@ -2,8 +2,9 @@
 
 Every function bears the name of the method it repeats and works on an array of integers in place of that object. It
 holds what can happen on a wire that loses nothing and without a reset: the rest is not here, and cannot come about,
-for `case.prepare` refuses what would bring it about. Constants are the originals; tests hold every dose against plant
-and firmware on the bus.
+for `case.prepare` refuses what would bring it about. One source for both would have to keep, as words of arrays, what
+a lost frame, a reset or a suspension leaves behind: harder to read in the device, and slower here. Constants are the
+originals; tests hold every dose against plant and firmware on the bus.
 """
 
 from firmware_sim import cgm as fw_cgm
@@ -19,14 +20,11 @@ from firmware_sim.cgm import (
     SESSION_SNA,
     SETTLING_SAMPLES,
 )
-from firmware_sim.control.fixed import round_divide
 from firmware_sim.control.layout import MEAL_CARBS, MEAL_NONE, MEAL_SIMPLE, MEAL_SNACK
 from firmware_sim.day import HOURS, STEPS_PER_HOUR
 from firmware_sim.ladder import AGE_SAFE_BASAL, SAMPLES_UP, State
 from firmware_sim.meals import CARBS_MAX
-from pumpbench.compiled import Words, helper, twin
-
-divide = twin(round_divide)
+from pumpbench.compiled import Words, helper
 
 NEVER = fw_cgm.NEVER
 SAMPLE_OK, SAMPLE_BELOW, SAMPLE_ABOVE = fw_cgm.STATE_OK, fw_cgm.STATE_BELOW_RANGE, fw_cgm.STATE_ABOVE_RANGE
@@ -225,18 +223,3 @@ def start(bolus: Words, dose: int) -> None:
 def remaining(bolus: Words) -> int:
     """`Boluses.remaining`."""
     return int(bolus[REMAINING] * bolus[OPEN])
-
-
-# ---- firmware_sim.firmware.Firmware
-
-
-@helper
-def insulin_left(limit: int, day: Words, bolus: Words) -> int:
-    """`Firmware._insulin_left`, mU."""
-    return max(limit * 20 - total(day) - remaining(bolus) * 10, 0)
-
-
-@helper
-def pram_left(limit: int, day: Words, bolus: Words) -> int:
-    """`Firmware._pram_left`, 0.1 ug."""
-    return max(limit - divide(total(day), 10) - remaining(bolus), 0)

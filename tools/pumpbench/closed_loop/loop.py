@@ -14,6 +14,7 @@ import numpy.typing as npt
 import firmware_sim
 import plant_server
 from can_bus.lockstep import STEP_MINUTES
+from firmware_sim import allowance
 from firmware_sim.control import layout
 from firmware_sim.pump import RATE_EXPIRES_AFTER
 from plant_server import mechanism, physiology
@@ -78,6 +79,9 @@ GLUCOSE, PLASMA_INSULIN, PLASMA_PRAMLINTIDE = range(3)
 """Rows of `Record.floats`."""
 
 control_step = compiled.control_step()
+limit_of = compiled.twin(allowance.limit_of)
+insulin_left = compiled.twin(allowance.insulin_left)
+pram_left = compiled.twin(allowance.pram_left)
 begin_meal, advance, plasma_glucose = physiology.begin_meal, physiology.advance, physiology.glucose
 interstitial, plasma_insulin = physiology.interstitial, physiology.plasma_insulin
 plasma_pramlintide = physiology.plasma_pramlintide
@@ -104,16 +108,6 @@ SCHEDULE_RUNS = -1
 INSULIN_UNITS, INSULIN_VOLUME, INSULIN_CAPACITY = INSULIN.stroke_units, INSULIN.stroke_volume, INSULIN.capacity
 PRAM_UNITS, PRAM_VOLUME, PRAM_CAPACITY = PRAMLINTIDE.stroke_units, PRAMLINTIDE.stroke_volume, PRAMLINTIDE.capacity
 INSULIN_PRIMED, PRAM_PRIMED = INSULIN.capacity - INSULIN.priming, PRAMLINTIDE.capacity - PRAMLINTIDE.priming
-
-
-@helper
-def limits_of(state: int, cgm: Words, insulin_blocked: bool) -> int:
-    """IN_LIMIT as `Firmware._control` sets it."""
-    if cgm[device.BELOW_RANGE]:
-        return layout.LIMIT_SUSPEND
-    if state == device.AUTO and not (cgm[device.DOUBTFUL] or insulin_blocked):
-        return layout.LIMIT_NONE
-    return layout.LIMIT_SCHEDULE
 
 
 @helper
@@ -253,10 +247,14 @@ def run(plan: Plan, record: Record) -> tuple[Words, Words]:
         inputs[layout.IN_BOLUS] = bolus
         inputs[layout.IN_MODE] = settings[MODE]
         inputs[layout.IN_RESET] = 1 if device.settling(cgm) else 0
-        inputs[layout.IN_LIMIT] = limits_of(rung, cgm, blocked)
+        inputs[layout.IN_LIMIT] = limit_of(
+            rung == device.AUTO, cgm[device.BELOW_RANGE] == 1, cgm[device.DOUBTFUL] == 1 or blocked
+        )
         inputs[layout.IN_OPEN] = device.remaining(asked)
-        inputs[layout.IN_INSULIN_LEFT] = device.insulin_left(settings[INSULIN_TDD], day, asked)
-        inputs[layout.IN_PRAM_LEFT] = device.pram_left(settings[PRAM_TDD], pram_day, pram_asked)
+        inputs[layout.IN_INSULIN_LEFT] = insulin_left(settings[INSULIN_TDD], device.total(day), device.remaining(asked))
+        inputs[layout.IN_PRAM_LEFT] = pram_left(
+            settings[PRAM_TDD], device.total(pram_day), device.remaining(pram_asked)
+        )
         inputs[layout.IN_PRAM_STOP] = 1 if pram_blocked or blocked else 0
         stop = 0 if rung == device.AUTO and not asked[device.OPEN] else layout.STOP_INSULIN
         stop |= 0 if rung == device.AUTO and not pram_asked[device.OPEN] else layout.STOP_PRAM
