@@ -24,7 +24,7 @@ from .calibration import Calibration
 from .caution import Caution
 from .cgm import Cgm
 from .control import layout
-from .control.core import control_step
+from .control.core import IOB_MAX, control_step
 from .control.fixed import Ints, round_divide
 from .control.layout import MODE_OFF
 from .delivery import Delivery
@@ -67,9 +67,10 @@ CHANGES_OF_THEIR_OWN = frozenset({State.INIT, State.SUSPENDED})
 
 NMT_BOOT_UP, NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 0, 5, 127
 
-STEP_SNA = 1048575
+ACK_NODE_CTRL, ACK_CONFIRM, ACK_SNOOZE = 1, 1, 2
+"""UI_AlarmAck: AlarmAckNode of an alarm of ours, and the two of AlarmAckAction."""
 
-IOB_MAX = 4090
+STEP_SNA = 1048575
 
 URGENT_LOW = 550
 """0.1 mg/dL below which UrgentLow is raised, in every state (requirement ALM-03)."""
@@ -233,8 +234,8 @@ class Firmware:
             self._caution.resume()
 
     def _on_alarm_ack(self, values: dict[str, int]) -> None:
-        if values["AlarmAckNode"] == 1 and values["AlarmAckAction"] in (1, 2):
-            self._alarms.acknowledge(values["AlarmAckInstance"], confirm=values["AlarmAckAction"] == 1)
+        if values["AlarmAckNode"] == ACK_NODE_CTRL and values["AlarmAckAction"] in (ACK_CONFIRM, ACK_SNOOZE):
+            self._alarms.acknowledge(values["AlarmAckInstance"], confirm=values["AlarmAckAction"] == ACK_CONFIRM)
 
     # ---- turns
 
@@ -485,7 +486,7 @@ class Firmware:
     def _command(self, state: State, step: int) -> None:
         if state == State.DELIVERY_UNCERTAIN and self._ladder.rung == State.SAFE_BASAL:
             self._pump.command(self._turn, Op.RESUME_SCHEDULE, step)
-        elif state in (State.AUTO, State.DEGRADED, State.DELIVERY_UNCERTAIN):
+        elif state in COMMANDING:
             rate, pramlintide = self._outputs[layout.OUT_RATE], self._outputs[layout.OUT_PRAM_RATE]
             if self._pump.command(self._turn, Op.SET_RATE, step, rate, pramlintide if rate > 0 else 0):
                 self._outputs[layout.OUT_LIMITERS] |= layout.LIMITER_MAX_BASAL

@@ -33,7 +33,6 @@ class Scheduler:
     """Runs what is due, in the order of the list.
 
     Attributes:
-        worst: name -> most work one run of the task has taken.
         overruns: runs beyond their budget, so far.
         late: name of the task that broke its budget in this tick, or "".
     """
@@ -41,7 +40,6 @@ class Scheduler:
     def __init__(self, tasks: tuple[Task, ...]) -> None:
         self._tasks = tasks
         self._last = [NEVER] * len(tasks)
-        self.worst = {task.name: 0 for task in tasks}
         self.overruns = 0
         self.late = ""
         self._in_a_row = 0
@@ -70,7 +68,6 @@ class Scheduler:
             work = task.work() + self._load[index]
             self._load[index] = 0
             total += work
-            self.worst[task.name] = max(self.worst[task.name], work)
             if work > task.budget:
                 self.overruns += 1
                 self.late = task.name

@@ -30,7 +30,7 @@ import plant_server.pump
 import plant_server.sensor
 import plant_server.set_point
 from can_bus import codec, faults, lockstep
-from firmware_sim import firmware, user
+from firmware_sim import caution, firmware, user
 from firmware_sim.control import core, layout
 
 MESSAGES = sorted(dbc.load().messages, key=lambda message: message.frame_id)
@@ -455,6 +455,13 @@ def high(message: str, signal: str) -> int:
         (plant_server.sensor.STATE_BELOW_RANGE, codec.choice("CGM_Reading", "CgmState", "BelowRange")),
         (plant_server.sensor.STATE_ABOVE_RANGE, codec.choice("CGM_Reading", "CgmState", "AboveRange")),
         (firmware.STEP_SNA, codec.choice("SYNC_Step", "StepIndex", "SNA")),
+        (firmware.ACK_NODE_CTRL, codec.choice("UI_AlarmAck", "AlarmAckNode", "CTRL")),
+        (firmware.ACK_CONFIRM, codec.choice("UI_AlarmAck", "AlarmAckAction", "Confirm")),
+        (firmware.ACK_SNOOZE, codec.choice("UI_AlarmAck", "AlarmAckAction", "Snooze")),
+        (caution.SIM_TIME_SNA, codec.choice("SYNC_Step", "SimTime", "SNA")),
+        (user.SEQUENCES, high("MODE_Cmd", "ModeCmdSeq") + 1),
+        (user.REQUEST_SUSPEND, codec.choice("MODE_Cmd", "SuspendRequest", "Suspend")),
+        (user.REQUEST_RESUME, codec.choice("MODE_Cmd", "SuspendRequest", "Resume")),
         (firmware.NMT_BOOT_UP, codec.choice("HB_CTRL", "NmtCtrl", "BootUp")),
         (firmware.NMT_OPERATIONAL, codec.choice("HB_CTRL", "NmtCtrl", "Operational")),
         (firmware.NMT_PRE_OPERATIONAL, codec.choice("HB_CTRL", "NmtCtrl", "PreOperational")),

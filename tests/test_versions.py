@@ -138,19 +138,17 @@ def firmware_of(version: tuple[int, int], folder: Path) -> str:
     return f"{sys.executable} {path} {{bus}}"
 
 
-@pytest.mark.parametrize("major", [MAJOR - 1, MAJOR + 1])
-def test_a_run_with_another_major_version_ends_at_once(major: int, pumpbench: Pumpbench, runs: Path) -> None:
-    done = pumpbench("run", "--firmware", firmware_of((major, 0), runs), "--days", 0.1, "--out", runs / "out")
+def test_a_run_with_another_major_version_ends_at_once(pumpbench: Pumpbench, runs: Path) -> None:
+    done = pumpbench("run", "--firmware", firmware_of((MAJOR + 1, 0), runs), "--days", 0.1, "--out", runs / "out")
     assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
-    assert re.search(rf"built for protocol {major}\.0, {OURS}: rebuild", done.stderr)
+    assert re.search(rf"built for protocol {MAJOR + 1}\.0, {OURS}: rebuild", done.stderr)
     assert not (runs / "out").exists()
 
 
-@pytest.mark.parametrize("minor", [MINOR - 1, MINOR + 1])
-def test_a_run_with_another_minor_version_says_so_in_one_line(minor: int, pumpbench: Pumpbench, runs: Path) -> None:
-    done = pumpbench("run", "--firmware", firmware_of((MAJOR, minor), runs), "--days", 0.1, "--out", runs / "out")
+def test_a_run_with_another_minor_version_says_so_in_one_line(pumpbench: Pumpbench, runs: Path) -> None:
+    done = pumpbench("run", "--firmware", firmware_of((MAJOR, MINOR + 1), runs), "--days", 0.1, "--out", runs / "out")
     assert (done.returncode, done.stderr.count("\n")) == (0, 1), done.stderr
-    assert re.match(rf"CTRL was built for protocol {MAJOR}\.{minor}, {OURS}", done.stderr)
+    assert re.match(rf"CTRL was built for protocol {MAJOR}\.{MINOR + 1}, {OURS}", done.stderr)
 
 
 # ---- a device that is slow to answer
