@@ -1,7 +1,8 @@
-"""How much the control law may do in a step: arithmetic of integers, which campaigns compile as they do the law."""
+"""How much the control law may do in a step: arithmetic of integers that the loop of campaigns uses as it is."""
 
 from .control.fixed import round_divide
 from .control.layout import LIMIT_NONE, LIMIT_SCHEDULE, LIMIT_SUSPEND
+from .ladder import AGE_DEGRADED
 
 
 def limit_of(auto: bool, suspended: bool, cautious: bool) -> int:
@@ -9,6 +10,11 @@ def limit_of(auto: bool, suspended: bool, cautious: bool) -> int:
     if suspended:
         return LIMIT_SUSPEND
     return LIMIT_NONE if auto and not cautious else LIMIT_SCHEDULE
+
+
+def stale_age(minutes: int) -> int:
+    """CfgStaleCgmLimit as the age of a sample from which on it is stale, in steps; it can only tighten (USR-05)."""
+    return min(minutes // 5 + 1, AGE_DEGRADED)
 
 
 def insulin_left(tdd: int, delivered: int, under_way: int) -> int:

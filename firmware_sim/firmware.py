@@ -4,6 +4,10 @@ It speaks only in its turn (see `can_bus.lockstep`). Between two tokens it only 
 the tasks in a fixed order: calibration and user input, sensor, pump, ladder, control law, commands, boluses, alarms,
 status. A bolus needs the pump's answers, so a step with one takes several turns.
 
+Here is the order of things. What is known lies in parts with a module each: what was heard and what is amiss on the
+bus (`wire`), mode and suspension (`user`), `meals`, the sensor (`cgm`), set-points (`pump`), boluses (`bolus`), what
+was given (`delivery`), doubts about clock and resets (`caution`), and how much the law may do (`ladder`, `allowance`).
+
 With a non-volatile memory it survives a reset at any instant: what it must not forget is stored before any frame that
 depends on it leaves.
 """
@@ -369,7 +373,7 @@ class Firmware:
             uncertain=self._boluses.uncertain,
             held=self._caution.held,
             fault=bool(self._failures & STOPS) or self._scheduler.bitten,
-            age_degraded=self._stale_age(),
+            age_degraded=allowance.stale_age(self._calibration.value("CfgStaleCgmLimit")),
         )
         return 1
 
@@ -396,10 +400,6 @@ class Firmware:
     def _sensor_silent(self, step: int) -> bool:
         """Whether the sensor's heartbeats have ceased."""
         return self._wire.silence("HB_CGM", step) >= TIMEOUT
-
-    def _stale_age(self) -> int:
-        """CfgStaleCgmLimit as the age of a sample, in steps; it can only tighten (requirement USR-05)."""
-        return min(self._calibration.value("CfgStaleCgmLimit") // 5 + 1, AGE_DEGRADED)
 
     def _scheduled(self, steps: int) -> int:
         """Insulin (mU) of the schedule in some steps."""

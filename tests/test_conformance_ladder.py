@@ -9,7 +9,7 @@ from pumpbench.conformance.suite import Verdict, select
 from can_bus import codec
 from can_bus.frame import Frame
 from can_bus.lockstep import Turn
-from firmware_sim import alarms, firmware, ladder, scheduler
+from firmware_sim import alarms, allowance, firmware, ladder, scheduler
 from firmware_sim.alarms import Alarms, Code
 from firmware_sim.bolus import Boluses
 from firmware_sim.firmware import Firmware
@@ -64,7 +64,7 @@ def gives_boluses(monkeypatch: Patch, state: State) -> None:
 
 def test_degraded_too_late(monkeypatch: Patch) -> None:
     monkeypatch.setattr(ladder, "AGE_DEGRADED", 5)
-    monkeypatch.setattr(Firmware, "_stale_age", lambda _self: 5)
+    monkeypatch.setattr(allowance, "stale_age", lambda _: 5)
     expect_failed("FAL-01", "DEGRADED when the newest sample is 4 steps old; Auto came")
 
 

@@ -9,7 +9,7 @@ from pumpbench.conformance.suite import select
 from test_conformance_numbers import of
 from test_conformance_reset import forget, hasty
 
-from firmware_sim import calibration, ladder, meals, user
+from firmware_sim import allowance, calibration, ladder, meals, user
 from firmware_sim.bolus import Boluses, Op
 from firmware_sim.firmware import Firmware
 from firmware_sim.meals import Meals
@@ -182,7 +182,7 @@ def test_an_echo_that_is_missing() -> None:
     ("age", "text"), [(99, "4 steps after the newest sample"), (4, "2 steps after the newest sample")]
 )
 def test_a_looser_stale_limit(monkeypatch: pytest.MonkeyPatch, age: int, text: str) -> None:
-    monkeypatch.setattr(Firmware, "_stale_age", lambda _: age)
+    monkeypatch.setattr(allowance, "stale_age", lambda _: age)
     monkeypatch.setattr(ladder, "AGE_DEGRADED", age)
     monkeypatch.setattr(ladder, "AGE_SAFE_BASAL", age + 3)
     expect_failed("USR-05", text)

@@ -568,7 +568,7 @@ def test_h6_totals_that_begin_anew_after_a_reset_of_the_pump() -> None:
 def test_a_firmware_that_goes_down_too_late_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(firmware_sim.ladder, "AGE_DEGRADED", 6)
     monkeypatch.setattr(firmware_sim.firmware, "AGE_DEGRADED", 6)
-    monkeypatch.setattr(firmware_sim.firmware.Firmware, "_stale_age", lambda self: 6)
+    monkeypatch.setattr(firmware_sim.allowance, "stale_age", lambda _: 6)
     bench = Bench(mode=S2)
     bench.run(24, 2500)
     for _ in range(12):

@@ -9,11 +9,13 @@ from bench import S2, Bench, calibration
 from firmware_sim.alarms import Alarms, Code
 from firmware_sim.bolus import Boluses, Drug, Op
 from firmware_sim.calibration import Calibration, parameter_names
+from firmware_sim.caution import Caution
 from firmware_sim.cgm import Cgm
 from firmware_sim.firmware import Firmware
 from firmware_sim.meals import Meals
 from firmware_sim.nvm import RamMemory
 from firmware_sim.pump import Pump
+from firmware_sim.user import REQUEST_RESUME, REQUEST_SUSPEND, User
 
 
 def taken_back(part: Any, new: Any) -> Any:
@@ -124,6 +126,37 @@ def test_a_calibration_that_lost_a_parameter_is_not_in_force() -> None:
     cut = Calibration()
     cut.restore(iter([words[0] - 1, *words[1:place], *words[place + 2 :]]))
     assert not cut.active
+
+
+def told(sequence: int, mode: int, request: int) -> dict[str, int]:
+    return {"ModeCmdSeq": sequence, "ModeRequest": mode, "SuspendRequest": request}
+
+
+def test_what_the_user_wants() -> None:
+    user = User()
+    assert not user.hear(told(7, 6, REQUEST_SUSPEND))
+    again = taken_back(user, User())
+    assert (again.mode, again.suspended) == (6, True)
+    assert not again.hear(told(7, 2, REQUEST_RESUME))  # obeyed before the reset
+    assert not again.hear(told(6, 2, REQUEST_RESUME))
+    assert (again.mode, again.suspended, again.sequence_errors) == (6, True, 1)
+    assert again.hear(told(8, 2, REQUEST_RESUME))
+    assert taken_back(User(), User()).hear(told(200, 2, REQUEST_RESUME))  # any number may be the first one
+
+
+def test_caution() -> None:
+    caution = Caution()
+    assert caution.check_clock(9, 9 * 300 + 61)
+    for step in (0, 8, 9, 10, 11):
+        assert not caution.held
+        caution = taken_back(caution, Caution())
+        caution.count_reset(step)
+    caution = taken_back(caution, Caution())
+    assert caution.held
+    for step in (12, 13, 14):
+        assert caution.clock_doubtful
+        caution.sample(step)
+    assert not caution.clock_doubtful
 
 
 def test_the_firmware_as_a_whole() -> None:

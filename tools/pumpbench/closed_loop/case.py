@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from can_bus.lockstep import STEPS_PER_DAY
+from firmware_sim.allowance import stale_age
 from firmware_sim.calibration import SET_CRC_INDEX, Calibration, parameter_names
-from firmware_sim.ladder import AGE_DEGRADED
 from plant_server import physiology
 from plant_server.mechanism import SUBSTEPS
 from plant_server.physiology import Patient, Variability, load_patient, parameters
@@ -221,7 +221,7 @@ def _calibration(key: _Key, tuning: Tuning, model: ControllerModel | None) -> tu
             raise CaseError(f"the device would not accept {names[index]} (CfgIndex {index}): raw {raw}")
     if not flashed.active:
         raise CaseError(f"the device would not accept the calibration: {names[SET_CRC_INDEX]} does not fit")
-    stale = min(flashed.value("CfgStaleCgmLimit") // 5 + 1, AGE_DEGRADED)
+    stale = stale_age(flashed.value("CfgStaleCgmLimit"))
     limits = flashed.value("CfgStuckSamples"), stale, flashed.value("CfgInsulinTdd"), flashed.value("CfgPramTdd")
     return np.array(flashed.parameters, np.int64), limits
 
