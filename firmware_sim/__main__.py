@@ -96,9 +96,7 @@ def serve(
     attended = None if port is None else _Attended(firmware, port)
     try:
         with open_link(url, filters=[message(name).can_id for name in [*subscriptions(), *own_messages()]]) as link:
-            boot = firmware.start()
-            if boot:
-                link.send(boot)
+            link.send(firmware.start())
             while not firmware.finished:
                 for frame in link.recv(None):
                     if firmware.reset_requested and frame.can_id == token and nvm is not None:

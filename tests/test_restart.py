@@ -53,8 +53,8 @@ def test_a_killed_firmware_goes_on_where_it_was(tmp_path: Path) -> None:
     again = Firmware(kept, Cause.PIN)
     kept.close()
     assert again._step == 4031
-    assert again._mode == MODES["s3"]
-    assert 1 <= len(again._boot_steps) <= 2  # a kill before the first step is no reset within a run
+    assert again._user.mode == MODES["s3"]
+    assert 1 <= len(again._caution._resets) <= 2  # a kill before the first step is no reset within a run
     assert again._calibration.active
 
 
