@@ -381,6 +381,31 @@ def test_a_bolus_that_goes_on_does_not_hold_up_the_other_drug() -> None:
     assert talk.speak() == [(PRAMLINTIDE, Op.COMMIT)]
 
 
+def test_of_two_boluses_the_one_the_pump_tells_of_is_followed() -> None:
+    for silent, told in ((INSULIN, PRAMLINTIDE), (PRAMLINTIDE, INSULIN)):
+        talk = Talk((INSULIN, 250), (PRAMLINTIDE, 300))
+        for op in (Op.PROGRAM, Op.COMMIT):
+            talk.speak()
+            talk.ack(INSULIN, op)
+            talk.ack(PRAMLINTIDE, op)
+            talk.boluses.listen()
+        talk.tell(told, Phase.DELIVERING, number=talk.boluses._open[told].number, delivered=100)
+        assert talk.next() == [(told, 100)]
+        assert talk.boluses.remaining(silent) > 0
+        assert not talk.boluses.uncertain  # agreed by both sides: a lost PUMP_BolusState changes nothing
+
+
+def test_a_cancel_without_an_answer_is_said_three_times_in_every_step() -> None:
+    talk = committed()
+    for _ in range(2):
+        talk.tell(INSULIN, Phase.PROGRAMMED, 0)
+        talk.next()
+        for _ in range(SENDS):
+            assert talk.speak() == [(INSULIN, Op.CANCEL)]
+            talk.boluses.listen()
+        assert talk.speak() == []
+
+
 def test_what_is_stored_of_an_open_bolus() -> None:
     talk = committed()
     assert talk.boluses.save() == [1, 1, 0, 250, 10 + EXPIRES_AFTER, 1, 250, 0, 0, 0, 0, 0, 0]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from firmware_sim.pump import Op, Pump
+from firmware_sim.pump import SEQUENCES, Op, Pump
 
 BASAL = 1425
 
@@ -34,6 +34,29 @@ def test_a_missing_total_is_assumed_from_the_command_in_force(op: Op, rate: int,
     command(pump, op, rate)
     assert pump.delivered(None, 1, BASAL) == assumed
     assert pump.delivered({**totals, "InsulinTotal": 500 + 300}, 2, BASAL) == 300 - assumed
+
+
+@pytest.mark.parametrize("total", [30, 100, 130])
+def test_after_a_reset_of_the_pump_nothing_that_was_assumed_comes_off_later(total: int) -> None:
+    """Its total begins anew: what was assumed may have been delivered before, and is in no total any more."""
+    pump = Pump()
+    pump.delivered({"PumpBootCount": 0, "InsulinTotal": 500, "PramTotal": 0}, 0, BASAL)
+    command(pump, Op.SET_RATE, 240)
+    assert pump.delivered(None, 1, BASAL) == 100
+    rebooted = {"PumpBootCount": 1, "InsulinTotal": total, "PramTotal": 0}
+    assert pump.delivered(rebooted, 2, BASAL) == max(total - 100, 0)
+    assert pump.delivered({**rebooted, "InsulinTotal": total + 90}, 3, BASAL) == 90
+
+
+def test_another_set_point_than_the_last_one_is_told_in_the_second_step_that_shows_it() -> None:
+    pump = Pump()
+    command(pump, Op.SET_RATE, 240)
+    status = {"PumpState": 1, "InsulinOcclusion": 0, "InsulinReservoir": 99, "PramOcclusion": 0, "PramReservoir": 99}
+    told = []
+    for step, shown in enumerate((pump._sequence + 9, pump._sequence, *[pump._sequence + 9] * 3, SEQUENCES)):
+        pump.status({**status, "PumpLastBasalSeq": shown}, step)
+        told.append(pump.unlike)
+    assert told == [False, False, False, True, True, False]
 
 
 def test_refusals_are_counted_one_by_one_for_both_drugs() -> None:
