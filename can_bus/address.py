@@ -1,4 +1,4 @@
-"""Where a hub listens: ``unix:/path`` or ``tcp:127.0.0.1:port``, and nothing that leaves this machine."""
+"""Where a hub listens: `unix:/path` or `tcp:127.0.0.1:port`, and nothing that leaves this machine."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Address:
 def parse_address(url: str) -> Address:
     """Return the address of a hub.
 
-    Raises BusUrlError for anything but ``unix:`` with a path that fits a socket address, or ``tcp:`` on the
+    Raises BusUrlError for anything but `unix:` with a path that fits a socket address, or `tcp:` on the
     loopback: the stream has neither a password nor encryption, so it must not leave the machine.
     """
     scheme, colon, rest = url.partition(":")

@@ -1,7 +1,7 @@
 """One classic CAN frame, and the 16 bytes it travels in.
 
-The byte layout is Linux' ``struct can_frame`` in little endian, on a hub's stream as well as on a raw
-SocketCAN socket, so a C program can ``read()`` it straight into the struct of ``<linux/can.h>``.
+The byte layout is Linux' `struct can_frame` in little endian, on a hub's stream as well as on a raw
+SocketCAN socket, so a C program can `read()` it straight into the struct of `<linux/can.h>`.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _new = tuple.__new__
 
 
 class Frame(NamedTuple):
-    """A classic CAN frame: ``can_id`` with the Linux flag bits, and up to 8 data bytes.
+    """A classic CAN frame: `can_id` with the Linux flag bits, and up to 8 data bytes.
 
-    In a remote frame the length of ``data`` is the DLC and its bytes are zero. A frame has no time stamp and
-    no channel: in lockstep the time is inside the frames. The constructor does not check anything; ``pack``
-    and ``to_message`` do.
+    In a remote frame the length of `data` is the DLC and its bytes are zero. A frame has no time stamp and
+    no channel: in lockstep the time is inside the frames. The constructor does not check anything; `pack`
+    and `to_message` do.
     """
 
     can_id: int
@@ -63,7 +63,7 @@ class Frame(NamedTuple):
 
 
 def pack(frames: Iterable[Frame]) -> bytes:
-    """Return the frames as consecutive 16-byte ``struct can_frame`` records.
+    """Return the frames as consecutive 16-byte `struct can_frame` records.
 
     Raises ValueError for more than 8 data bytes or an id that does not fit 32 bits. It does not check that a
     standard id stays below 0x800: a faulty node can send such a frame too.
@@ -76,7 +76,7 @@ def pack(frames: Iterable[Frame]) -> bytes:
 
 
 def unpack(buffer: bytes | bytearray) -> list[Frame]:
-    """Return the frames in ``buffer``, whose length must be a multiple of 16.
+    """Return the frames in `buffer`, whose length must be a multiple of 16.
 
     Bytes beyond the DLC and the padding are ignored; the data of remote frames becomes zero bytes.
     """

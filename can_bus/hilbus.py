@@ -1,4 +1,4 @@
-"""The python-can plugin: ``can.Bus(interface="hilbus", channel="unix:/path")``."""
+"""The python-can plugin: `can.Bus(interface="hilbus", channel="unix:/path")`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from can_bus.inproc import InprocLink, inproc_hub
 class HilBus(can.BusABC):
     """A hub, or a bus inside this process, for everything that speaks python-can.
 
-    Works with ``can.Notifier``, ``can.logger`` and ``can.viewer`` alike. Time stamps are taken when a message is
+    Works with `can.Notifier`, `can.logger` and `can.viewer` alike. Time stamps are taken when a message is
     read, not when it was switched. CAN FD is refused.
     """
 
@@ -31,7 +31,7 @@ class HilBus(can.BusABC):
         """Connect.
 
         Args:
-            channel: ``unix:/path``, ``tcp:127.0.0.1:port`` or ``inproc:name``.
+            channel: `unix:/path`, `tcp:127.0.0.1:port` or `inproc:name`.
             can_filters: as for every python-can bus, applied in this process.
             receive_own_messages: whether sent messages come back, in their place in the bus's order.
             wait: seconds to wait for a hub that is not there yet.
@@ -56,11 +56,11 @@ class HilBus(can.BusABC):
         return to_message(frame, timestamp=time.time(), channel=self.channel), False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a message; ``timeout`` is not needed, a hub always takes it."""
+        """Send a message; `timeout` is not needed, a hub always takes it."""
         self._link.send([from_message(msg)])
 
     def fileno(self) -> int:
-        """Readable when a message waits: one ``recv`` takes one message, nothing is buffered here."""
+        """Readable when a message waits: one `recv` takes one message, nothing is buffered here."""
         return self._link.fileno()
 
     def shutdown(self) -> None:

@@ -4,7 +4,7 @@ It promises what a lockstep bench needs: one order of all frames for every recei
 unless asked for, a joining node that knows from when on it misses nothing, and a loud end when something dies. It
 is no model of the electrical bus: no arbitration by identifier, no bit timing, no error counters.
 
-Run one by hand with ``python -m can_bus.hub unix:/tmp/bus tcp:127.0.0.1:29536``.
+Run one by hand with `python -m can_bus.hub unix:/tmp/bus tcp:127.0.0.1:29536`.
 """
 
 from __future__ import annotations
@@ -66,22 +66,22 @@ class _Client:
 class Hub:
     """A switch for CAN frames that listens on any number of Unix and loopback TCP addresses.
 
-    There are two ways to run it. *Embedded*: a node hosts it, talks through ``local_link()``, and every blocking
+    There are two ways to run it. *Embedded*: a node hosts it, talks through `local_link()`, and every blocking
     receive of that link does the switching; while the host computes nothing is forwarded, and in lockstep nobody
-    minds. *Standalone*: ``serve_forever()`` in a process or thread of its own.
+    minds. *Standalone*: `serve_forever()` in a process or thread of its own.
 
-    A hub belongs to the thread that drives it. Only ``stop``, ``clients`` and, while another thread is in
-    ``serve_forever``, ``wait_for_clients`` may be used from elsewhere.
+    A hub belongs to the thread that drives it. Only `stop`, `clients` and, while another thread is in
+    `serve_forever`, `wait_for_clients` may be used from elsewhere.
 
-    It never holds back a sender, so senders can't deadlock; a reader that falls behind by more than ``cap`` frames
-    is disconnected instead, with an error in the log here and the reason in a ``BusLost`` there.
+    It never holds back a sender, so senders can't deadlock; a reader that falls behind by more than `cap` frames
+    is disconnected instead, with an error in the log here and the reason in a `BusLost` there.
     """
 
     def __init__(self, urls: str | Iterable[str] = (), *, cap: int = DEFAULT_CAP) -> None:
         """Listen on the URLs at once.
 
         Args:
-            urls: ``unix:/path``, ``tcp:127.0.0.1:port`` (port 0 chooses one, see ``urls``); none is fine for a
+            urls: `unix:/path`, `tcp:127.0.0.1:port` (port 0 chooses one, see `urls`); none is fine for a
                 hub that has only local links.
             cap: how many frames the hub keeps for one slow reader before it disconnects it.
         """
@@ -113,13 +113,13 @@ class Hub:
     # -- driving it --------------------------------------------------------------------------------------------
 
     def local_link(self, filters: Iterable[int] | None = None) -> LocalLink:
-        """Return a link of the hosting node; its ``recv`` runs the hub. Several are fine, in one thread."""
+        """Return a link of the hosting node; its `recv` runs the hub. Several are fine, in one thread."""
         link = LocalLink(self, filters)
         self._locals = (*self._locals, link)
         return link
 
     def serve_forever(self) -> None:
-        """Switch until ``stop`` is called (from a signal handler or another thread)."""
+        """Switch until `stop` is called (from a signal handler or another thread)."""
         with self._changed:
             self._server = threading.current_thread()
         try:
@@ -131,7 +131,7 @@ class Hub:
                 self._changed.notify_all()
 
     def start(self) -> Self:
-        """Serve in a daemon thread of this process until ``stop`` or ``close``."""
+        """Serve in a daemon thread of this process until `stop` or `close`."""
         thread = threading.Thread(target=self.serve_forever, name="can hub", daemon=True)
         with self._changed:
             if self._server is not None:
@@ -141,7 +141,7 @@ class Hub:
         return self
 
     def stop(self) -> None:
-        """Make ``serve_forever`` return; safe in signal handlers and other threads. Does not close the hub."""
+        """Make `serve_forever` return; safe in signal handlers and other threads. Does not close the hub."""
         self._stopping = True
         self._wake_up()
 
@@ -150,7 +150,7 @@ class Hub:
             os.eventfd_write(self._wake, 1)
 
     def poll(self, timeout: float | None) -> bool:
-        """Wait up to ``timeout`` seconds (None: for ever) for something to do, do it; False when there was nothing."""
+        """Wait up to `timeout` seconds (None: for ever) for something to do, do it; False when there was nothing."""
         if self.closed:
             raise ValueError("the hub is closed")
         if self._leaving:
@@ -195,7 +195,7 @@ class Hub:
         return len(self._members)
 
     def wait_for_clients(self, count: int, timeout: float) -> None:
-        """Switch until ``count`` clients are on the bus; TimeoutError names those that came."""
+        """Switch until `count` clients are on the bus; TimeoutError names those that came."""
         end = time.monotonic() + timeout
         while len(self._members) < count:
             left = end - time.monotonic()
@@ -248,7 +248,7 @@ class Hub:
         return chunk
 
     def _greet(self, client: _Client, chunk: bytes) -> bytes:
-        """Answer a hello and return what came behind it; an incomplete hello waits in ``partial``."""
+        """Answer a hello and return what came behind it; an incomplete hello waits in `partial`."""
         if chunk[: len(hub_wire.MAGIC)] != hub_wire.MAGIC[: len(chunk)]:
             _log.error("%s did not send a hello of this protocol: disconnected", client.name)
             self._dismiss(client, Reason.NOT_A_CLIENT, 0)
@@ -401,7 +401,7 @@ class Hub:
     # -- the end of the hub ------------------------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """The descriptor to select on when something else must be watched too; readable means: call ``poll(0)``."""
+        """The descriptor to select on when something else must be watched too; readable means: call `poll(0)`."""
         self._selected = True
         return self._epoll.fileno()
 
@@ -412,8 +412,8 @@ class Hub:
     def close(self, linger: float = 5.0) -> None:
         """Switch what was sent, deliver what waits, say goodbye, remove the socket files. Calling it again is fine.
 
-        A reader that does not take its frames within ``linger`` seconds in all loses them, with an error in the log
-        here and a ``BusLost`` there.
+        A reader that does not take its frames within `linger` seconds in all loses them, with an error in the log
+        here and a `BusLost` there.
         """
         if self.closed:
             return

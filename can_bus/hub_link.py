@@ -27,7 +27,7 @@ _LEN_OF_LAST = hub_wire.LEN_OFFSET - RECORD_SIZE
 
 
 class HubLink(BaseLink):
-    """A node's connection to a hub at ``unix:/path`` or ``tcp:127.0.0.1:port``.
+    """A node's connection to a hub at `unix:/path` or `tcp:127.0.0.1:port`.
 
     Opening returns after the hub's welcome: from then on no frame is missed. An embedded hub gives its welcome
     only while its host is receiving. A link does not reconnect when the hub comes back.
@@ -45,7 +45,7 @@ class HubLink(BaseLink):
         """Connect and wait for the welcome.
 
         Args:
-            url: ``unix:/path`` or ``tcp:127.0.0.1:port``.
+            url: `unix:/path` or `tcp:127.0.0.1:port`.
             filters: standard identifiers wanted, None for all frames.
             echo: whether the own frames come back, in their place in the bus's order.
             wait: seconds to wait for a hub that is not there yet.
@@ -100,13 +100,13 @@ class HubLink(BaseLink):
             raise can.CanInitializationError(f"{self._url}: what answers there is not a hub of this protocol")
 
     def recv(self, timeout: float | None) -> list[Frame]:
-        """Return all frames that arrived, waiting for the first; see ``Link.recv``."""
+        """Return all frames that arrived, waiting for the first; see `Link.recv`."""
         if self._wanted is None:  # the common case needs no clock
             return self._receive(timeout, _CHUNK)
         return self._receive_wanted(lambda left: self._receive(left, _CHUNK), timeout)
 
     def recv_one(self, timeout: float | None) -> Frame | None:
-        """Return one frame, or None on time-out; the next one stays in the socket, where ``select`` sees it."""
+        """Return one frame, or None on time-out; the next one stays in the socket, where `select` sees it."""
         frames = self._receive_wanted(lambda left: self._receive(left, RECORD_SIZE - len(self._partial)), timeout)
         return frames[0] if frames else None
 
@@ -167,7 +167,7 @@ class HubLink(BaseLink):
             self.send_packed(pack(frames))
 
     def send_packed(self, records: bytes) -> None:
-        """Send what ``pack`` made. The caller vouches for the format: a malformed record ends the connection."""
+        """Send what `pack` made. The caller vouches for the format: a malformed record ends the connection."""
         if self._dead is not None:
             raise self._lose("")
         try:

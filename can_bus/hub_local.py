@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class LocalLink(BaseLink):
-    """The link of the process that hosts a hub; ``recv`` and ``recv`` alone makes the hub switch."""
+    """The link of the process that hosts a hub; `recv` and `recv` alone makes the hub switch."""
 
     def __init__(self, hub: Hub, filters: Iterable[int] | None) -> None:
         super().__init__(hub.urls[0] if hub.urls else "hub", filters)
@@ -29,7 +29,7 @@ class LocalLink(BaseLink):
         self._pending = self._pending + frames if self._pending else frames
 
     def recv(self, timeout: float | None) -> list[Frame]:
-        """Run the hub until frames for this node arrived; see ``Link.recv``."""
+        """Run the hub until frames for this node arrived; see `Link.recv`."""
         hub = self._hub
         if hub.closed or self._dead is not None:
             raise self._lose("the hub was closed")
@@ -52,13 +52,13 @@ class LocalLink(BaseLink):
             self.send_packed(pack(frames))
 
     def send_packed(self, records: bytes) -> None:
-        """Put on the bus what ``pack`` made."""
+        """Put on the bus what `pack` made."""
         if self._hub.closed or self._dead is not None:
             raise self._lose("the hub was closed")
         self._hub.switch_local(self, records)
 
     def fileno(self) -> int:
-        """The hub's descriptor: it is readable when ``recv(0)`` should be called, which may return nothing."""
+        """The hub's descriptor: it is readable when `recv(0)` should be called, which may return nothing."""
         return self._hub.fileno()
 
     def close(self) -> None:

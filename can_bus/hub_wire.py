@@ -8,14 +8,14 @@ Everything is little endian and 16 bytes long.
        /* magic "HILBUS\r\n", version 1, flags bit 0: send me my own frames too, pid: for the hub's log, or 0 */
 
 2. The hub answers with one *welcome* of the same layout (pid: the hub's). From now on the client misses nothing.
-3. From then on both sides send ``struct can_frame`` of ``<linux/can.h>``, one after the other, nothing between::
+3. From then on both sides send `struct can_frame` of `<linux/can.h>`, one after the other, nothing between::
 
        struct record { uint32_t can_id; uint8_t len; uint8_t pad[3]; uint8_t data[8]; };   /* len <= 8 */
 
-   ``can_id`` carries the flag bits CAN_EFF_FLAG, CAN_RTR_FLAG, CAN_ERR_FLAG. Many records in one ``write`` are one
-   batch and are switched together; a reader must expect several records, or part of one, per ``read``.
-4. Before the hub closes a connection it sends a *goodbye* when it still can: a record with ``can_id`` 0xFFFFFFFF and
-   ``len`` 0xFF, whose data are two uint32_t, a reason and a detail. In place of the welcome it means "refused".
+   `can_id` carries the flag bits CAN_EFF_FLAG, CAN_RTR_FLAG, CAN_ERR_FLAG. Many records in one `write` are one
+   batch and are switched together; a reader must expect several records, or part of one, per `read`.
+4. Before the hub closes a connection it sends a *goodbye* when it still can: a record with `can_id` 0xFFFFFFFF and
+   `len` 0xFF, whose data are two uint32_t, a reason and a detail. In place of the welcome it means "refused".
    An end of the stream without goodbye means that the hub died.
 
 ::

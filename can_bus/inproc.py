@@ -24,7 +24,7 @@ _registry_lock = threading.Lock()
 class InprocHub:
     """A bus shared by the links of one process; links may live in different threads, or all in one.
 
-    The bus ``inproc:name`` exists while somebody has a link to it. It cannot be reached from another process.
+    The bus `inproc:name` exists while somebody has a link to it. It cannot be reached from another process.
     """
 
     def __init__(self, name: str, cap: int = DEFAULT_CAP) -> None:
@@ -67,7 +67,7 @@ class InprocHub:
             self.detach(link)
 
     def close(self) -> None:
-        """End the bus for all its links: their receives raise ``BusLost`` once they have read what waits."""
+        """End the bus for all its links: their receives raise `BusLost` once they have read what waits."""
         with self.lock:
             links, self._links = self._links, ()
             for link in links:
@@ -87,7 +87,7 @@ def inproc_hub(name: str) -> InprocHub:
 
 
 class InprocLink(BaseLink):
-    """A node's place on an ``InprocHub``."""
+    """A node's place on an `InprocHub`."""
 
     _numbers = itertools.count(1)
 
@@ -127,7 +127,7 @@ class InprocLink(BaseLink):
             os.eventfd_write(self._event, 1)
 
     def recv(self, timeout: float | None) -> list[Frame]:
-        """Return all frames that wait, waiting for the first; see ``Link.recv``."""
+        """Return all frames that wait, waiting for the first; see `Link.recv`."""
         if self._wanted is None:  # the common case needs no clock
             return self._take(timeout)
         return self._receive_wanted(self._take, timeout)
@@ -180,7 +180,7 @@ class InprocLink(BaseLink):
             self._hub.switch(self, _checked(frames))
 
     def fileno(self) -> int:
-        """An event descriptor, made on first use; readable when ``recv(0)`` has something to say."""
+        """An event descriptor, made on first use; readable when `recv(0)` has something to say."""
         if self._event is None:
             with self._hub.lock:
                 waiting = bool(self._rest) or not self._queue.empty()
@@ -202,7 +202,7 @@ class InprocLink(BaseLink):
 
 
 def _checked(frames: Sequence[Frame]) -> list[Frame]:
-    """Return a copy that other links may keep, with the checks of ``pack`` and what a trip over a wire would do."""
+    """Return a copy that other links may keep, with the checks of `pack` and what a trip over a wire would do."""
     batch = []
     for frame in frames:
         can_id, data = frame

@@ -42,8 +42,8 @@ class Link(Protocol):
     def recv(self, timeout: float | None) -> list[Frame]:
         """Wait until at least one frame is there and return all that arrived, oldest first.
 
-        ``timeout`` in seconds, ``None`` waits for ever, ``0`` only looks. An empty list means time-out and
-        nothing else: a lost bus or a lost frame raises ``BusLost``.
+        `timeout` in seconds, `None` waits for ever, `0` only looks. An empty list means time-out and
+        nothing else: a lost bus or a lost frame raises `BusLost`.
         """
 
     def send(self, frames: Sequence[Frame]) -> None:
@@ -53,7 +53,7 @@ class Link(Protocol):
         """Leave the bus. What was sent before is still delivered. Calling it again does nothing."""
 
     def fileno(self) -> int:
-        """A descriptor that is readable when ``recv(0)`` has something to say, for ``select``."""
+        """A descriptor that is readable when `recv(0)` has something to say, for `select`."""
 
     def __enter__(self) -> Self: ...
 

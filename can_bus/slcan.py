@@ -36,7 +36,7 @@ _REPLIES: Final = (b"", b"z", b"Z", b"V", b"v", b"N", b"F", b"d", b"D", b"b", b"
 
 
 class SlcanLink(BaseLink):
-    """A link over slcan: ``slcan:/dev/ttyACM0@500000``, a pty, or any pyserial URL such as ``socket://host:port``.
+    """A link over slcan: `slcan:/dev/ttyACM0@500000`, a pty, or any pyserial URL such as `socket://host:port`.
 
     python-can sets the adapter up; the frames are then read and written here in bulk, because python-can reads a
     serial port byte by byte. slcan has no error frames (sending one is a ValueError), no flow control beyond the
@@ -75,7 +75,7 @@ class SlcanLink(BaseLink):
         self._port.write_timeout = _WRITE_LIMIT
 
     def recv(self, timeout: float | None) -> list[Frame]:
-        """Return all frames that arrived, waiting for the first; see ``Link.recv``."""
+        """Return all frames that arrived, waiting for the first; see `Link.recv`."""
         return self._receive_wanted(lambda left: self._parse(self._read(left)), timeout)
 
     def _read(self, timeout: float | None) -> bytes:

@@ -36,11 +36,11 @@ _SLICE = 1.0
 
 
 class SocketcanLink(BaseLink):
-    """A raw CAN socket on ``socketcan:vcan0`` or any other SocketCAN interface.
+    """A raw CAN socket on `socketcan:vcan0` or any other SocketCAN interface.
 
     The kernel throws frames away when a socket's receive queue is full (about 280 frames by default). This link asks
-    for a queue of some 80,000 (root) or whatever ``net.core.rmem_max`` allows, and the kernel's count of what did not
-    fit turns into a ``BusLost``, at the latest one second after. It cannot see frames that the interface itself lost
+    for a queue of some 80,000 (root) or whatever `net.core.rmem_max` allows, and the kernel's count of what did not
+    fit turns into a `BusLost`, at the latest one second after. It cannot see frames that the interface itself lost
     before the socket, on a real wire or in the kernel's backlog: the counters of the protocol do that. And on a machine
     with several CPUs, frames that two nodes send in the same instant may reach two readers in different orders.
     """
@@ -70,7 +70,7 @@ class SocketcanLink(BaseLink):
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, rules)
 
     def recv(self, timeout: float | None) -> list[Frame]:
-        """Return all frames that wait, waiting for the first; see ``Link.recv``."""
+        """Return all frames that wait, waiting for the first; see `Link.recv`."""
         self._reading = True
         try:
             return self._recv(timeout)
@@ -134,7 +134,7 @@ class SocketcanLink(BaseLink):
             raise self._lose(f"{count} frames lost: this reader was too slow for the kernel's receive queue")
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send the batch; a full transmit queue is waited out for some seconds, then it raises ``BusLost``."""
+        """Send the batch; a full transmit queue is waited out for some seconds, then it raises `BusLost`."""
         if self._dead is not None:
             raise self._lose("")
         records = pack(frames)
@@ -195,7 +195,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class FrameBatch:
-    """Room for many frames, moved by one ``recvmmsg`` or ``sendmmsg`` (Python's own calls move one frame each)."""
+    """Room for many frames, moved by one `recvmmsg` or `sendmmsg` (Python's own calls move one frame each)."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -211,13 +211,13 @@ class FrameBatch:
         self._place = ctypes.byref(self._messages)
 
     def receive(self, flags: int) -> int:
-        """Return how many frames were received; OSError as ``recv`` would raise it."""
+        """Return how many frames were received; OSError as `recv` would raise it."""
         while (count := _libc.recvmmsg(self._descriptor, self._place, _BATCH, flags, None)) < 0:
             _raise_errno()
         return int(count)
 
     def send(self, records: bytes) -> int:
-        """Return how many of the records were sent, at least one; OSError as ``send`` would raise it."""
+        """Return how many of the records were sent, at least one; OSError as `send` would raise it."""
         size = min(len(records), len(self._view))
         self._view[:size] = records[:size]
         while (count := _libc.sendmmsg(self._descriptor, self._place, size // RECORD_SIZE, 0)) < 0:

@@ -32,8 +32,8 @@ def open_bus(url: str, *, receive_own_messages: bool = False) -> can.BusABC:
     """Open a bus for a program that speaks python-can.
 
     Raises BusUrlError when the URL cannot be understood and can.CanInitializationError when nothing is there.
-    ``socketcan:`` gives python-can's own bus, which loses frames silently when its reader is slow; the link of
-    ``open_link`` does not.
+    `socketcan:` gives python-can's own bus, which loses frames silently when its reader is slow; the link of
+    `open_link` does not.
     """
     scheme = _scheme(url)
     if scheme in ("unix", "tcp"):
@@ -52,9 +52,9 @@ def open_link(url: str, *, filters: Iterable[int] | None = None, wait: float = 0
     """Open a bus for a node of this bench.
 
     Args:
-        url: see ``BusUrlError``'s text for the forms.
+        url: see `BusUrlError`'s text for the forms.
         filters: the standard identifiers wanted; None for every frame. Error frames always come.
-        wait: seconds to wait for a hub that is not there yet (``unix:`` and ``tcp:`` only).
+        wait: seconds to wait for a hub that is not there yet (`unix:` and `tcp:` only).
 
     Raises BusUrlError when the URL cannot be understood and can.CanInitializationError when nothing is there.
     """
@@ -84,7 +84,7 @@ def _scheme(url: str) -> str:
 
 
 def _python_can(url: str) -> tuple[str, dict[str, Any]]:
-    """Split ``interface:channel[@bitrate][,key=value...]`` into an interface and the settings of its bus."""
+    """Split `interface:channel[@bitrate][,key=value...]` into an interface and the settings of its bus."""
     interface, _, channel = url.partition(":")
     if interface not in VALID_INTERFACES:
         raise BusUrlError(f"{url!r}: python-can knows no interface {interface!r}; {_EXPECTED}")

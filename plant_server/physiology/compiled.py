@@ -21,9 +21,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 Array = npt.NDArray[np.float64]
 
-#: one-dimensional arrays that are written to, and that are only read (a `Patient`'s own are read-only)
 WRITES = types.Array(float64, 1, "C")
 READS = types.Array(float64, 1, "C", readonly=True)
+"""One-dimensional arrays that are written to, and that are only read (a `Patient`'s own are read-only)."""
 
 
 def _package_digest() -> bytes:
@@ -33,8 +33,8 @@ def _package_digest() -> bytes:
     return digest.digest()
 
 
-#: digest of every source file of the package
 PACKAGE_DIGEST = _package_digest()
+"""Digest of every source file of the package."""
 
 
 def _tie_to_package(dispatcher: Any) -> None:

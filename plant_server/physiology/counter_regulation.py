@@ -9,8 +9,8 @@ from . import parameters as par
 from . import states as st
 from .compiled import Array, compiled
 
-#: mg/dL; the risk grows no further below this glucose
 RISK_IS_GREATEST_AT = 60.0
+"""mg/dL; the risk grows no further below this glucose."""
 
 
 @compiled

@@ -10,8 +10,8 @@ from . import parameters as par
 from . import states as st
 from .compiled import READS, WRITES, Array, compiled, entry_point, float64, void
 
-#: mg; less is no meal (and α of a meal of 1e-320 mg would be infinite)
 LEAST_MEAL = 1e-9
+"""mg; less is no meal (and α of a meal of 1e-320 mg would be infinite)."""
 
 
 @compiled
@@ -39,8 +39,8 @@ def steepness(meal: float, b: float, c: float) -> float:
     return 5.0 / (2.0 * meal * min(1.0 - b, c))
 
 
-#: mg; the small-meal rule treats a meal below this size as one of this size, else its rate would know no bound
 SMALLEST_MEAL = 1000.0
+"""mg; the small-meal rule treats a meal below this size as one of this size, else its rate would know no bound."""
 
 
 @compiled

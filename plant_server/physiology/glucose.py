@@ -4,9 +4,9 @@ from . import parameters as par
 from . import states as st
 from .compiled import READS, Array, compiled, entry_point, float64
 
-#: mg/dL. The brain's constant uptake would draw plasma glucose below zero when insulin is extreme; below this
-#: level, which no living patient reaches, it fades linearly to nothing. simglucose freezes negative states.
 UPTAKE_FADES_BELOW = 10.0
+"""mg/dL. The brain's constant uptake would draw plasma glucose below zero when insulin is extreme; below this
+level, which no living patient reaches, it fades linearly to nothing. simglucose freezes negative states."""
 
 
 @compiled

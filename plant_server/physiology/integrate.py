@@ -17,21 +17,23 @@ from .glucose import glucose_derivatives
 from .insulin import PMOL_PER_U, insulin_derivatives
 from .pramlintide import PMOL_PER_UG, pramlintide_derivatives, slowing
 
-#: length of a Runge-Kutta step, min
 STEP_MIN = 0.5
-MINUTES_PER_DAY = 1440.0
-#: Masses below this many of their units become zero: they change no digit of anything, but arithmetic on numbers
-#: below 1e-308 is a hundred times slower.
-VANISHED = 1e-200
+"""Length of a Runge-Kutta step, min."""
 
-#: most that can arrive within one step: far above anything a pump or a mouth can do, far below any overflow
+MINUTES_PER_DAY = 1440.0
+
+VANISHED = 1e-200
+"""Masses below this many of their units become zero: they change no digit of anything, but arithmetic on numbers
+below 1e-308 is a hundred times slower."""
+
 MOST_INSULIN_U = 100.0
 MOST_PRAMLINTIDE_UG = 1e5
 MOST_CARBS_MG = 1e6
+"""Most that can arrive within one step: far above anything a pump or a mouth can do, far below any overflow."""
 
-#: change in the argument of k_empt's tanh that one part of a step may hold, and where refining ends
 SWITCHING_PER_PART = 1.0
 MOST_PARTS_FOR_ACCURACY = 8.0
+"""Change in the argument of k_empt's tanh that one part of a step may hold, and where refining ends."""
 
 _STATES = len(st.STATES)
 _PARAMETERS = len(par.PARAMETERS)

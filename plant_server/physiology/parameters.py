@@ -13,8 +13,9 @@ class Parameter(NamedTuple):
 
 
 _PAPER = "Pons Torres 2025, variability"
-#: source of what a patient file must hold
 COHORT = "simglucose 0.2.11 (MIT), adult cohort"
+"""Source of what a patient file must hold."""
+
 _S2013 = "Dalla Man 2014; value LoopInsighT1 (MIT) default"
 _T1DMS = "T1DMS, undocumented; LoopInsighT1 (MIT)"
 _RISK = "Dalla Man 2014; population value, also in ReplayBG"

@@ -22,12 +22,12 @@ _PRAMLINTIDE = _DATA / "pramlintide.csv"
 
 PHYSIOLOGIES = ("S2008", "S2013")
 
-#: mg/dL; outside this range a person with diabetes is not at rest, and counter-regulation has no meaning
 BASAL_GLUCOSE_RANGE = (60.0, 300.0)
+"""mg/dL; outside this range a person with diabetes is not at rest, and counter-regulation has no meaning."""
 
-#: Type 1 diabetes shows 0.65 of the plasma concentration of healthy subjects (Kolterman 1996, label).
 TYPE_1 = "+type1"
 TYPE_1_BIOAVAILABILITY = 0.65
+"""Type 1 diabetes shows 0.65 of the plasma concentration of healthy subjects (Kolterman 1996, label)."""
 
 # Columns of a patient file. Those of simglucose keep its names, so its file can be used after adding carb_ratio.
 _REQUIRED = {
@@ -35,7 +35,6 @@ _REQUIRED = {
     for index, record in enumerate(par.PARAMETERS)
     if record.source == par.COHORT
 }
-#: parameters of S2013 and their values when a file has no such column
 _OPTIONAL = {
     "small_meal": 30000.0,
     "r1": 0.81,
@@ -48,8 +47,9 @@ _OPTIONAL = {
     "kGSRs": 0.2,
     "kGSRd": 0.1,
 }
+"""Parameters of S2013 and their values when a file has no such column."""
+
 _OTHER = ("Name", "physiology", "Gb", "carb_ratio", "u2ss")
-#: columns of simglucose's file that follow from the others, or that it does not use itself
 _REDUNDANT = (
     *("i", "EGPb", "Ipb", "Ilb", "m5", "CL", "HEb", "Gpb", "Gtb", "Rdb", "PCRb", "dosekempt", "isc1ss", "isc2ss"),
     *("patient_history", "basal_U_per_h", *(f"x0_{i:2d}" for i in range(1, 14))),
@@ -57,17 +57,22 @@ _REDUNDANT = (
     *("r2", "Gth", "Ith", "SRHb", "SQgluc_k1", "SQgluc_k2", "SQgluc_kc1", "SQgluc_Vgcn", "Vgcn"),
     *("age", "TDI", "CF", *(f"x0_{i}" for i in range(1, 20))),
 )
-#: what T1DMS calls columns of ours
+"""Columns of simglucose's file that follow from the others, or that it does not use itself."""
+
 _ALIASES = {"Gnb": "Hb", "CR": "carb_ratio", "names": "Name"}
-#: how far numbers that say the same may lie apart: files are written with few digits
+"""What T1DMS calls columns of ours."""
+
 _AGREEMENT = 0.01
+"""How far numbers that say the same may lie apart: files are written with few digits."""
+
 _PRAMLINTIDE_COLUMNS = ("a_s", "kq1", "kq12", "kq2", "ke", "VP", "ka", "n", "d", "e")
 
 _MAY_BE_ZERO = {"Fsnc", "ke1", "Vmx", "m4", "small_meal", "r3", "kcounter", "Hb", "kGSRs", "kGSRd", "n"}
-#: shares, and the greatest value each can have
 _SHARES = {"b": 0.999, "d": 0.999, "f": 1.0}
-#: 1/min; a faster process does not fit a Runge-Kutta step of 30 s
+"""Shares, and the greatest value each can have."""
+
 FASTEST_RATE = 2.0
+"""1/min; a faster process does not fit a Runge-Kutta step of 30 s."""
 
 
 class Cell(NamedTuple):

@@ -4,8 +4,8 @@ from . import parameters as par
 from . import states as st
 from .compiled import READS, Array, compiled, entry_point, float64
 
-#: 1 µg in pmol; molar mass 3949.4 g/mol (Symlin prescribing information)
 PMOL_PER_UG = 253.20
+"""1 µg in pmol; molar mass 3949.4 g/mol (Symlin prescribing information)."""
 
 
 @compiled

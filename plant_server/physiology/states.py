@@ -60,5 +60,5 @@ STATES = (
     D,
 ) = range(len(STATES))
 
-#: states with an equation of their own: all but the meal size
 INTEGRATED = D
+"""States with an equation of their own: all but the meal size."""

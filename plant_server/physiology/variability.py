@@ -23,16 +23,16 @@ class MealFactors(NamedTuple):
     insulin: float = 1.0
 
 
-#: a meal like the patient's average one
 NOMINAL = MealFactors()
+"""A meal like the patient's average one."""
 
-#: what can vary, and what it means
 SOURCES = {
     "k_abs": "intestinal absorption rate, per meal, U(0.7, 1.3)",
     "f": "share of absorbed glucose that reaches plasma, per meal, U(0.9, 1.1), capped at f = 1",
     "insulin_pk": "insulin absorption, per meal, one factor U(0.7, 1.3) on ka1, ka2 and kd",
     "circadian": "insulin sensitivity over the day, once per patient, amplitude U(-0.3, 0.3), phase U(0, 2π)",
 }
+"""What can vary, and what it means."""
 
 
 class Variability:

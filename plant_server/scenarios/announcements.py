@@ -58,11 +58,6 @@ class Announcement(NamedTuple):
     carbs_g: float | None  # estimate; None where only the time is told
     meal_step: int  # when the meal starts, truly
 
-    @property
-    def offset_minutes(self) -> int:
-        """MEAL_Announce.MealOffset: from now to the start of the meal, negative for one told late."""
-        return (self.meal_step - self.step) * STEP_MINUTES
-
 
 def announcements(scenario: Scenario, policy: Policy, seed: int, patient: str) -> tuple[Announcement, ...]:
     """The planned meals as they are told, in order of telling.

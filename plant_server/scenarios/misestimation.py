@@ -65,9 +65,6 @@ class Gaussian(Estimate):
         return carbs_g * max(0.0, 1 + (self.mean_percent + self.sd_percent * z) / 100)
 
 
-ESTIMATES: dict[str, type[Estimate]] = {"exact": Exact, "kawamura": Kawamura, "gaussian": Gaussian}
-"""By the name people use."""
-
 AnyEstimate = Annotated[
     Exact | Kawamura | Gaussian,
     Field(discriminator="model"),
