@@ -6,6 +6,7 @@ import random
 import pytest
 from bench import NMA, OPEN_LOOP, S2, Bench, calibration
 from pumpbench.calibration import CalibrationError, Tuning, calibrate
+from pumpbench.controller_model import ControllerModelError
 
 from can_bus import codec
 from can_bus.lockstep import Phase
@@ -263,7 +264,7 @@ def test_a_value_that_does_not_fit_is_named(changes: dict[str, float], what: str
 def test_a_patient_without_a_model_is_named() -> None:
     from dataclasses import replace
 
-    with pytest.raises(CalibrationError, match="nobody"):
+    with pytest.raises(ControllerModelError, match="nobody"):
         calibrate(replace(load_patient("adult#001"), name="nobody"))
 
 

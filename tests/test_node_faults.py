@@ -23,7 +23,7 @@ from pumpbench.faults import (
     set_value,
     slow_task,
 )
-from pumpbench.node import tear
+from pumpbench.rig.power import tear
 from pumpbench.runfolder import RunFolder
 from serial_cable import cable
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from conftest import Pumpbench
 from pumpbench import rig
-from pumpbench.cli import STATUS_OF
+from pumpbench.cli.statuses import STATUS_OF
 
 from plant_server.physiology import SOURCES, PatientError, load_patient
 from plant_server.physiology import parameters as par

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pumpbench import cli, rig
+from pumpbench import rig
 from pumpbench.capture import Capture
+from pumpbench.cli import options
+from pumpbench.cli.statuses import status_of
+from pumpbench.cli.terminal import EXIT_USAGE
 from pumpbench.trace import Trace
 
 from can_bus import codec
@@ -47,14 +50,14 @@ def test_every_sensor_runs_and_tells_its_status_hourly(name: str, tmp_path: Path
     ids = [frame.can_id for frame in frames]
     status = codec.message("CGM_Status").can_id
     assert all(ids[k + 1] == codec.message("CGM_Reading").can_id for k, can_id in enumerate(ids) if can_id == status)
-    assert name in cli.SENSORS
+    assert name in options.SENSORS
 
 
 @pytest.mark.parametrize("name", built_in())
 def test_every_scenario_runs(name: str, tmp_path: Path) -> None:
     one = prepared(tmp_path, scenario=name, steps=144, seed=5)
     assert one.run.scenario.name == name
-    assert name in cli.SCENARIOS
+    assert name in options.SCENARIOS
     _, trace = play(one)
     planned = sum(meal.carbs_g for meal in one.run.scenario.meals if meal.step <= 144)
     assert sum(meal.carbs_g for meal in trace.meals) == pytest.approx(planned, abs=0.1)
@@ -112,7 +115,7 @@ def test_wrong_names_are_usage_errors(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="did you mean tuning"):
         prepared(tmp_path, scenario="tunning")
     for error in (SensorError("x"), ScenarioError("x")):
-        assert cli._status(error) == cli.EXIT_USAGE
+        assert status_of(error) == EXIT_USAGE
 
 
 PAGE = (Path(__file__).parents[1] / "docs" / "sensors-and-scenarios.md").read_text(encoding="utf-8")

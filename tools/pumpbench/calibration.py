@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from can_bus import codec
 from firmware_sim.calibration import SET_CRC_INDEX, parameter_names, set_crc
 from plant_server.physiology import Patient
-from pumpbench.controller_model import SAMPLE_MINUTES, ControllerModel, lags, shipped_models
+from pumpbench.controller_model import SAMPLE_MINUTES, ControllerModel, lags, model_of
 
 MODES = {"nma": 2, "ma": 3, "sma": 4, "s1": 5, "s2": 6, "s3": 7, "s4": 8}
 """`--strategy` names of the paper's seven modes -> CtrlMode of the DBC."""
 
 
 class CalibrationError(ValueError):
-    """There is no controller model for this patient, or a value does not fit its parameter."""
+    """A value does not fit its parameter; the text says which, and what does."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +76,11 @@ def calibrate(patient: Patient, tuning: Tuning | None = None, model: ControllerM
         model: what the controller knows of the patient; default: the one that comes with the package.
 
     Raises:
-        CalibrationError: the patient has no controller model, or a value is outside its parameter's range.
+        ControllerModelError: the patient has no controller model.
+        CalibrationError: a value is outside its parameter's range.
     """
     tuning = tuning or Tuning()
-    if model is None:
-        model = shipped_models().get(patient.name)
-    if model is None:
-        raise CalibrationError(
-            f"no controller model for patient {patient.name!r}: the package has {', '.join(shipped_models())}; "
-            "`pumpbench identify-controller` makes one for patients of your own"
-        )
+    model = model or model_of(patient)
     physical = {
         "CfgBasal": patient.basal_u_per_h,
         "CfgCarbRatio": model.carb_ratio,

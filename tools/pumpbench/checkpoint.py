@@ -30,8 +30,9 @@ import plant_server
 from plant_server.physiology import STATES
 from pumpbench import fork, rig
 from pumpbench.capture import Capture, read_candump, write_candump
-from pumpbench.node import InProcess
+from pumpbench.identity import BUILT_IN
 from pumpbench.rewind import Diverged, RewoundPlant, before
+from pumpbench.rig.power import InProcess
 
 CHECKPOINT, LOG, STATE, MEMORY = "checkpoint.json", "bus.log", "state.json", "memory.bin"
 FORMAT: Final = "pumpbench checkpoint 1"
@@ -206,7 +207,7 @@ def take(instant: fork.Instant, out: Path) -> None:
     info = instant.info
     if out.exists():
         raise CheckpointError(f"{out} exists already; choose another folder")
-    if info["firmware"] != fork.BUILT_IN:
+    if info["firmware"] != BUILT_IN:
         raise CheckpointError(
             f"{instant.name}: the firmware was {info['firmware']!r}, whose state nobody can read; "
             f"fork the run itself: --from {instant.name}@{instant.at}"

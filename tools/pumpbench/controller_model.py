@@ -70,6 +70,30 @@ def shipped_models() -> dict[str, ControllerModel]:
     return read_models(SHIPPED)
 
 
+def model_of(patient: Patient, file: Path | None = None, asked: str | None = None) -> ControllerModel:
+    """The model the controller works with for one patient.
+
+    Args:
+        patient: as loaded.
+        file: of models, or None for those of the package.
+        asked: how the patient was asked for, if not by name: one of a file of its own is none of the package's,
+            whatever its name.
+
+    Raises:
+        ControllerModelError: there is none.
+    """
+    models = shipped_models() if file is None else read_models(file)
+    asked = asked or patient.name
+    if file is None and asked not in models:
+        raise ControllerModelError(
+            f"{asked}: the package has controller models of {', '.join(models)} only; make one with "
+            f"`pumpbench identify-controller {asked} --out models.csv`, and give it with --controller models.csv"
+        )
+    if patient.name not in models:
+        raise ControllerModelError(f"{file}: no model of patient {patient.name!r}; it has {', '.join(models)}")
+    return models[patient.name]
+
+
 def read_models(path: Path) -> dict[str, ControllerModel]:
     """Read a CSV file with the columns of `ControllerModel`; lines that start with # are comments.
 

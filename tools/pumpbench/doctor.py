@@ -7,7 +7,6 @@ keeps count. After every answer it waits a moment, so that what is said behind S
 
 import contextlib
 import logging
-import os
 import tempfile
 import time
 from collections import deque
@@ -130,7 +129,7 @@ def _open(url: str, stack: contextlib.ExitStack, *, hub: bool) -> Link:
 def _start(request: Request, url: str, place: Path, stack: contextlib.ExitStack) -> rig.Child:
     command = rig.firmware_command(request.firmware, url, place / "nvm", "kept")
     log = stack.enter_context((place / "firmware.log").open("ab"))
-    child = rig.Child("firmware", command, os.environ | {"PUMPBENCH_BUS": url, "PYTHONUNBUFFERED": "1"}, log, False)
+    child = rig.Child("firmware", command, url, log)
     stack.callback(child.end)
     return child
 

@@ -19,13 +19,10 @@ from can_bus.lockstep import STEP_SECONDS
 from pumpbench import rig
 from pumpbench.capture import Frames
 from pumpbench.faults import AnyFault, Faults, load
-from pumpbench.identity import firmware_sha256
+from pumpbench.identity import BUILT_IN, firmware_sha256
 from pumpbench.rewind import Origin
 from pumpbench.rig import Change, Request
 from pumpbench.runfolder import RunFolder
-
-BUILT_IN = "built-in"
-"""As --firmware: the reference firmware, after a record of another one."""
 
 
 class ForkError(ValueError):

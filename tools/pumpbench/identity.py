@@ -18,6 +18,9 @@ PACKAGES = ("numpy", "numba", "python-can", "cantools", "autosar-e2e", "rerun-sd
 SOMEBODY_ELSES = "none"
 """In place of a firmware's command: the device runs by itself."""
 
+BUILT_IN = "built-in"
+"""In place of a firmware's command in run.json, and as --firmware of a fork: the reference firmware."""
+
 
 def versions() -> dict[str, Any]:
     """Versions of the bench, of the wire, of Python and of the packages a result depends on."""

@@ -34,7 +34,8 @@ from pumpbench.conformance.driver import Bench, Silent, Violation
 from pumpbench.conformance.registry import Need
 from pumpbench.identity import SOMEBODY_ELSES
 from pumpbench.rewind import boots_up
-from pumpbench.rig import SERIAL, RigError
+from pumpbench.rig import RigError
+from pumpbench.rig.buses import SERIAL
 from pumpbench.trace import labels
 
 if TYPE_CHECKING:

@@ -86,9 +86,12 @@ def closed_loop(kind: str, *, days: int, runs: int = 3) -> list[Figure]:
                 strategy=STRATEGY,
                 steps=days * STEPS_PER_DAY,
                 bus=bus,
-                progress=lambda step, stamps=stamps: stamps.append((step, time.perf_counter())),  # type: ignore[misc]
             )
-            rig.execute(rig.prepare(request))
+
+            def stamp(step: int, _of: int, stamps: list[tuple[int, float]] = stamps) -> None:
+                stamps.append((step, time.perf_counter()))
+
+            rig.execute(rig.prepare(request), stamp)
             (first, started), (last, ended) = stamps[1], stamps[-1]
             values.append((last - first) / STEPS_PER_DAY / (ended - started))
             if kind != "inproc":

@@ -91,7 +91,8 @@ def prepare(case: Case) -> Plan:
     """Look everything up, draw everything random.
 
     Raises:
-        CaseError, PatientError, ScenarioError, SensorError, CalibrationError: what is wrong with the case.
+        CaseError, PatientError, ScenarioError, SensorError, ControllerModelError, CalibrationError:
+            what is wrong with the case.
     """
     steps = case.steps
     if case.mode not in MODES:

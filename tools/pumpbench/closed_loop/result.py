@@ -70,7 +70,8 @@ def simulate(case: Case) -> Result:
     The first call on a machine compiles, which takes a minute; the code is kept on disk.
 
     Raises:
-        CaseError, PatientError, ScenarioError, SensorError, CalibrationError: what is wrong with the case.
+        CaseError, PatientError, ScenarioError, SensorError, ControllerModelError, CalibrationError:
+            what is wrong with the case.
         LoopError: the run left what the loop can represent.
     """
     plan = prepare(case)

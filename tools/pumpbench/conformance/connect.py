@@ -1,7 +1,6 @@
 """Bring up the device under test: in this process, as a process on a hub of its own, or where somebody has put it."""
 
 import contextlib
-import os
 import shlex
 import subprocess
 import tempfile
@@ -15,8 +14,8 @@ from can_bus.url import open_link
 from pumpbench.conformance.device import Device, Remote
 from pumpbench.conformance.registry import Need
 from pumpbench.identity import SOMEBODY_ELSES
-from pumpbench.node import Process
 from pumpbench.rig import Child, NodeDied, RigError, firmware_command
+from pumpbench.rig.power import Process
 
 RESET_SECONDS = 30.0
 """How long a command that resets a device may take."""
@@ -75,7 +74,7 @@ def _started(
 
         def launch(memory: MemoryState) -> Child:
             command = firmware_command(firmware, url, nvm if keeps else None, memory)
-            return Child("firmware", command, os.environ | {"PUMPBENCH_BUS": url}, log, ready=False)
+            return Child("firmware", command, url, log)
 
         process = Process(launch, nvm)
 

@@ -5,7 +5,7 @@ from can_bus.lockstep import Node
 from firmware_sim.firmware import NVM_BYTES, NVM_WORDS, Cause, Firmware
 from firmware_sim.nvm import ERASED, RamMemory
 from pumpbench.conformance.device import InProcess
-from pumpbench.node import tear
+from pumpbench.rig.power import tear
 
 
 def reference() -> InProcess:

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pumpbench.terminal import EXIT_USAGE, EXIT_WRONG, Failed, console
+from pumpbench.cli import options
+from pumpbench.cli.terminal import EXIT_USAGE, EXIT_WRONG, Failed, console
 
 if TYPE_CHECKING:
     from pumpbench.comparison.report import Report
@@ -24,7 +25,7 @@ def diff(
         int | None, typer.Option(help="Compare this bus only: 0 the device's, 1 the plant's.", min=0, max=1)
     ] = None,
     out: Annotated[Path | None, typer.Option(help=OUT)] = None,
-    json_file: Annotated[str | None, typer.Option("--json", help="Write the report to this file; - is stdout.")] = None,
+    json_file: options.JsonReport = None,
 ) -> None:
     """Compare two runs frame by frame. Exit status 1 if they differ."""
     from pumpbench.comparison.align import Ignore, compare  # noqa: PLC0415

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pumpbench.terminal import EXIT_DEAD, EXIT_USAGE, EXIT_WRONG, Failed, console, errors
+from pumpbench.cli.terminal import EXIT_DEAD, EXIT_USAGE, EXIT_WRONG, Failed, console, errors
 
 
 def doctor(

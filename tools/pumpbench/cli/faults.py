@@ -5,23 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
-from pumpbench.terminal import EXIT_USAGE, EXIT_WRONG, Failed, console, errors, progress_bar
+from pumpbench.cli import options
+from pumpbench.cli.terminal import EXIT_USAGE, EXIT_WRONG, Failed, console, errors, progress_bar
 
 JOBS = "Processes (default: one per CPU)."
-MODES = "Comma list of nma, sma, ma, s1, s2, s3, s4; or all."
 
 
-def _modes(text: str) -> list[str]:
-    from pumpbench.calibration import MODES as known  # noqa: PLC0415
-
-    names = list(known) if text == "all" else [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise Failed(EXIT_USAGE, f"there is no mode {name!r}; choose of {', '.join(known)}, or all")
-    return names
-
-
-def faults_command(
+def faults(
     kind: Annotated[str | None, typer.Argument(help="A kind, for its keys and examples (default: list all).")] = None,
 ) -> None:
     """The catalogue of faults: what each does, what it puts to the test, who notices."""
@@ -56,7 +46,7 @@ def faults_command(
 
 def matrix(
     seeds: Annotated[int, typer.Option(help="Seeds of every entry in every mode.", min=1)] = 20,
-    modes: Annotated[str, typer.Option(help=MODES)] = "all",
+    modes: options.Modes = "all",
     jobs: Annotated[int | None, typer.Option(help=JOBS, min=1)] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write the table to this page.")] = None,
 ) -> None:
@@ -66,7 +56,7 @@ def matrix(
     from pumpbench.probe import jobs_or  # noqa: PLC0415
 
     with progress_bar() as progress:
-        cells = matrices.run(seeds, _modes(modes), jobs=jobs_or(jobs), told=progress("matrix"))
+        cells = matrices.run(seeds, options.modes(modes), jobs=jobs_or(jobs), told=progress("matrix"))
     wrong = [cell for cell in cells if cell.wrong]
     for cell in wrong[:20]:
         errors.print(f"{cell.entry.name}, mode {cell.mode}, seed {cell.seed}: {cell.wrong}", markup=False)
@@ -84,7 +74,7 @@ def hunt(
     out: Annotated[Path, typer.Option(help="Folder of the verdicts and of the tests; an interrupted hunt goes on.")],
     runs: Annotated[int, typer.Option(help="Cases of this seed, counted from 0.", min=1)] = 1000,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.", min=0)] = 1,
-    modes: Annotated[str, typer.Option(help=MODES)] = "all",
+    modes: options.Modes = "all",
     jobs: Annotated[int | None, typer.Option(help=JOBS, min=1)] = None,
     bus: Annotated[str, typer.Option(help="inproc, hub, or a URL.")] = "inproc",
     firmware: Annotated[str | None, typer.Option(help='Another firmware, on a bus; "{bus}" becomes its URL.')] = None,
@@ -97,10 +87,8 @@ def hunt(
     from pumpbench import hunt as hunts  # noqa: PLC0415
     from pumpbench.probe import jobs_or  # noqa: PLC0415
 
-    settings = hunts.Settings(
-        out, runs, seed, tuple(_modes(modes)), jobs_or(jobs) if bus in ("inproc", "hub") else 1, bus, firmware, max_low,
-        max_high,
-    )  # fmt: skip
+    processes = jobs_or(jobs) if bus in ("inproc", "hub") else 1  # a bus of somebody's has room for one run
+    settings = hunts.Settings(out, runs, seed, tuple(options.modes(modes)), processes, bus, firmware, max_low, max_high)
     with progress_bar() as progress:
         result = hunts.run(settings, progress("hunt"), _tell)
     console.print(f"{result.runs} cases, {result.injected} faults at work, {result.failed} failures")

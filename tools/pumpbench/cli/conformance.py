@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pumpbench.terminal import EXIT_DEAD, EXIT_USAGE, EXIT_WRONG, Failed, console, errors, progress_bar
+from pumpbench.cli import options
+from pumpbench.cli.terminal import EXIT_DEAD, EXIT_USAGE, EXIT_WRONG, Failed, console, errors, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,10 +17,7 @@ if TYPE_CHECKING:
 
 def conformance(
     bus: Annotated[str, typer.Option(help="inproc (the reference), hub, or the URL of the device's bus.")] = "inproc",
-    firmware: Annotated[
-        str | None,
-        typer.Option(help='Command that starts the device, "{bus}" and "{nvm}" in it; none: it runs by itself.'),
-    ] = None,
+    firmware: options.Device = None,
     only: Annotated[str, typer.Option(help="Comma list of requirements or groups: SEN-01,FAL (default: all).")] = "",
     modes: Annotated[str, typer.Option(help="Modes the device must take up, a comma list (default: as found).")] = "",
     settings: Annotated[
@@ -28,10 +26,10 @@ def conformance(
     out: Annotated[Path | None, typer.Option(help="Folder for the report, JUnit XML and logs of failures.")] = None,
     junit: Annotated[Path | None, typer.Option(help="Write JUnit XML to this file.")] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write requirement -> check -> result to this page.")] = None,
-    json_file: Annotated[str | None, typer.Option("--json", help="Write the report to this file; - is stdout.")] = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to wait for the end of a turn.", min=0.05)] = 5.0,
-    connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the first answer.", min=0.1)] = 10.0,
-    reset_hook: Annotated[str | None, typer.Option(help="Command that resets a device that runs by itself.")] = None,
+    json_file: options.JsonReport = None,
+    timeout: options.TurnTimeout = 5.0,
+    connect_timeout: options.FirstTimeout = 10.0,
+    reset_hook: options.DeviceHook = None,
     long: Annotated[bool, typer.Option(help="The long form of the checks that have one.")] = False,
     list_only: Annotated[bool, typer.Option("--list", help="Show the requirements and how each is checked.")] = False,
 ) -> None:
@@ -50,7 +48,7 @@ def conformance(
     if list_only:
         _list(wanted)
         return
-    must = _modes(modes)
+    must = options.modes(modes) if modes else []
     limits = thresholds.load(settings or thresholds.DEFAULT)
     try:
         with (
@@ -90,16 +88,6 @@ def conformance(
 
 def _names(text: str) -> list[str]:
     return [name.strip().upper() for name in text.split(",") if name.strip()]
-
-
-def _modes(text: str) -> list[str]:
-    from pumpbench.calibration import MODES  # noqa: PLC0415
-
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    for name in names:
-        if name not in MODES:
-            raise Failed(EXIT_USAGE, f"there is no mode {name!r}; choose of {', '.join(MODES)}")
-    return names
 
 
 def _list(wanted: "Sequence[Requirement]") -> None:

@@ -5,16 +5,14 @@ from typing import Annotated
 
 import typer
 
-from pumpbench.cli_diff import IGNORE, OUT, RECORDS, tell
-from pumpbench.terminal import EXIT_DEAD, EXIT_WRONG, progress_bar
+from pumpbench.cli import options
+from pumpbench.cli.diff import IGNORE, OUT, RECORDS, tell
+from pumpbench.cli.terminal import EXIT_DEAD, EXIT_WRONG, progress_bar
 
 
 def replay(
     run: Annotated[Path, typer.Argument(metavar="RUN", help=RECORDS)],
-    firmware: Annotated[
-        str | None,
-        typer.Option(help='Command that starts the device, "{bus}" and "{nvm}" in it; none: it runs by itself.'),
-    ] = None,
+    firmware: options.Device = None,
     bus: Annotated[
         str | None,
         typer.Option(
@@ -25,11 +23,11 @@ def replay(
     keep_going: Annotated[
         bool, typer.Option("--keep-going", help="Compare on behind the first difference, with the recorded inputs.")
     ] = False,
-    timeout: Annotated[float, typer.Option(help="Seconds to wait for the end of a turn.", min=0.05)] = 5.0,
-    connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the first answer.", min=0.1)] = 10.0,
-    reset_hook: Annotated[str | None, typer.Option(help="Command that resets a device that runs by itself.")] = None,
+    timeout: options.TurnTimeout = 5.0,
+    connect_timeout: options.FirstTimeout = 10.0,
+    reset_hook: options.DeviceHook = None,
     out: Annotated[Path | None, typer.Option(help=OUT)] = None,
-    json_file: Annotated[str | None, typer.Option("--json", help="Write the report to this file; - is stdout.")] = None,
+    json_file: options.JsonReport = None,
 ) -> None:
     """Feed what a recorded device heard into a firmware. Exit status 1 if it answers otherwise, 3 if not at all."""
     from pumpbench import replay as replays  # noqa: PLC0415

@@ -12,7 +12,7 @@ from can_bus.frame import Frame
 from firmware_sim.nvm import ERASED, HEADER_WORDS, FileMemory, Memory, RamMemory, bank_size
 
 if TYPE_CHECKING:
-    from pumpbench.rig import Child
+    from pumpbench.rig.processes import Child
 
 
 def tear(memory: Memory, words: int) -> None:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pumpbench.terminal import EXIT_DEAD, EXIT_USAGE, Failed, console, errors
+from pumpbench.cli.terminal import EXIT_DEAD, EXIT_USAGE, Failed, console, errors
 
 if TYPE_CHECKING:
     from pumpbench.recording.scene import Scene
