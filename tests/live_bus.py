@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pyarrow as pa
-from pumpbench.capture import Capture, Frames, read_candump
+from pumpbench.candump import read_candump
+from pumpbench.capture import Capture
+from pumpbench.frames import Frames
 from pumpbench.recording.tool import quiet_environment, rerun_binary
 from rerun.chunk import RrdReader
 from synthetic_capture import Loop

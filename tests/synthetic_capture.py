@@ -7,7 +7,8 @@ import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from pumpbench.capture import Capture, Frames
+from pumpbench.capture import Capture
+from pumpbench.frames import Frames
 
 import dbc
 from can_bus import codec

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pumpbench import bench, faults
-from pumpbench.bench import Outcome, frame_text
+from pumpbench.bench import Outcome
 from pumpbench.rig import RigError
 from pumpbench.runfolder import RunFolder
+from pumpbench.signals import frame_text
 
 from can_bus import codec
 from can_bus.codec import Transmitter

@@ -29,7 +29,8 @@ from typing import Any
 import can
 import pytest
 from conftest import ROOT
-from pumpbench.capture import Capture, read_lines
+from pumpbench.candump import read_lines
+from pumpbench.capture import Capture
 from test_transports import need_vcan
 
 import dbc

@@ -12,7 +12,9 @@ import cantools.logreader
 import numpy as np
 import pytest
 from e2e.p02 import e2e_p02_check
-from pumpbench.capture import Capture, Frames, read_candump, write_candump
+from pumpbench.candump import read_candump, write_candump
+from pumpbench.capture import Capture
+from pumpbench.frames import Frames
 from synthetic_capture import Loop, as_frames, dropping, random_frames
 
 import dbc

@@ -11,7 +11,7 @@ from pumpbench.bench import Outcome
 from pumpbench.catalogue import Entry, entries
 from pumpbench.faults import KINDS, drop, load
 from pumpbench.probe import Probe, Verdict, in_parallel, judge
-from pumpbench.trace import labels
+from pumpbench.signals import labels
 from pydantic import ValidationError
 
 SEEDS = 20 if os.environ.get("PUMPBENCH_NIGHTLY") else 2

@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 import pytest
 from conftest import ROOT, Pumpbench
-from pumpbench.capture import read_candump, read_lines, write_candump
+from pumpbench.candump import read_candump, read_lines, write_candump
 from pumpbench.convert import ConvertError, convert
 from synthetic_capture import Loop, dropping
 from typer.testing import CliRunner

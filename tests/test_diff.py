@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from conftest import Pumpbench
 from pumpbench import bench
-from pumpbench.capture import Capture, Frames, write_candump
+from pumpbench.candump import write_candump
+from pumpbench.capture import Capture
 from pumpbench.comparison import folder
 from pumpbench.comparison.account import partings, per_message, settings
 from pumpbench.comparison.align import Comparison, Ignore, compare
@@ -18,6 +19,7 @@ from pumpbench.comparison.picture import write_picture
 from pumpbench.comparison.record import Record
 from pumpbench.comparison.report import Report, signal_rows
 from pumpbench.faults import drop
+from pumpbench.frames import Frames
 from rerun.chunk import RrdReader
 
 from can_bus import codec
@@ -402,4 +404,4 @@ def test_a_log_with_names_of_its_own_is_compared_bus_by_bus(frames: Frames, tmp_
 def test_another_dbc_is_told(frames: Frames) -> None:
     foreign = Record("old", frames, {"dbc_crc32": "00000000"})
     text = Report(compare(frames, frames), foreign, Record("new", frames)).text()
-    assert "old was recorded with another pumpbench.dbc (CRC-32 00000000)" in text
+    assert "old was recorded with another pumpbench.dbc: CRC-32 00000000, this one" in text

@@ -6,7 +6,8 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from pumpbench.capture import Capture, Follower, Frames, NewRun
+from pumpbench.capture import Capture, Follower, NewRun
+from pumpbench.frames import Frames
 from synthetic_capture import Loop, dropping
 
 from can_bus import codec

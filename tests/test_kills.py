@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from pumpbench.capture import read_candump
+from pumpbench.candump import read_candump
 from pumpbench.hazards import Monitor
 from test_restart import DEADLINE, wait_for
 

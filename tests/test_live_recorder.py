@@ -30,7 +30,8 @@ from live_bus import (
     viewer,
 )
 from pumpbench import recorder
-from pumpbench.capture import Capture, read_candump
+from pumpbench.candump import read_candump
+from pumpbench.capture import Capture
 from pumpbench.repair import repair
 from pumpbench.rig import Request, RigError, prepare
 from pumpbench.runfolder import RunFolder, RunFolderError

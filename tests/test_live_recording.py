@@ -6,7 +6,8 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 from live_bus import free_port
-from pumpbench.capture import Capture, Follower, Frames
+from pumpbench.capture import Capture, Follower
+from pumpbench.frames import Frames
 from pumpbench.recording.file import write_recording
 from pumpbench.recording.live import LiveRecording
 from pumpbench.trace import Trace

@@ -25,6 +25,7 @@ import pytest
 from conftest import ROOT, Pumpbench
 from matplotlib.image import imread
 from pumpbench.closeups import LONGEST, MAX_CLOSE_UPS, CloseUp, close_ups
+from pumpbench.events import AlarmEvent, FaultEvent
 from pumpbench.recording import viewing
 from pumpbench.recording.columns import wire_bits
 from pumpbench.recording.file import APPLICATION
@@ -35,7 +36,7 @@ from pumpbench.recording.tool import RecordingError, quiet_environment, rerun_bi
 from pumpbench.runfolder import RunFolder
 from pumpbench.story import notes
 from pumpbench.summary import FAULT, write_close_ups
-from pumpbench.trace import AlarmEvent, FaultEvent, Trace
+from pumpbench.trace import Trace
 from rerun.chunk import RrdReader
 from synthetic_capture import Loop, as_frames, dropping
 

@@ -12,7 +12,7 @@ from pumpbench import faults as fault_files
 from pumpbench.capture import Capture
 from pumpbench.catalogue import entries
 from pumpbench.faults import Faults
-from pumpbench.trace import labels
+from pumpbench.signals import labels
 
 from can_bus.yaml_file import FileError
 from firmware_sim.firmware import Firmware

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from pumpbench.capture import Capture, Frames, read_candump, write_candump
+from pumpbench.candump import read_candump, write_candump
+from pumpbench.capture import Capture
+from pumpbench.frames import Frames
 from pumpbench.recording.columns import describe
 from pumpbench.recording.file import APPLICATION, write_recording
 from pumpbench.recording.snapshot import Shot, snapshot

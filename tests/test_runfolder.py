@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pumpbench import runfolder
-from pumpbench.capture import Frames
+from pumpbench.frames import Frames
 from pumpbench.runfolder import FILES, RunFolder, RunFolderError
 from synthetic_capture import Loop
 

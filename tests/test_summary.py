@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from pumpbench.capture import Capture
+from pumpbench.events import AlarmEvent, FaultEvent
 from pumpbench.summary import FAULT, MAX_LINES, _alarm_lines, _headline, alarm_bars, binned, write_summary
-from pumpbench.trace import AlarmEvent, FaultEvent, Trace
+from pumpbench.trace import Trace
 from synthetic_capture import Loop, dropping
 
 INFO = {"patient": "adult#001", "strategy": "s2", "scenario": "synthetic", "seed": 1}

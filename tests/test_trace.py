@@ -7,7 +7,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from pumpbench.capture import Capture
-from pumpbench.trace import PARQUET_NAME, FaultEvent, FaultSpan, Trace, decode, labels, signals
+from pumpbench.events import FaultEvent, FaultSpan
+from pumpbench.signals import decode, labels, signals
+from pumpbench.trace import PARQUET_NAME, Trace
 from synthetic_capture import MEALS, Loop, as_frames, dropping, random_frames
 
 import dbc

@@ -21,19 +21,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from can_bus import codec
 from can_bus.faults import clock, seconds
-from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench import fork as forks
 from pumpbench import rig
-from pumpbench.capture import Capture, Frames
+from pumpbench.capture import Capture
+from pumpbench.events import AlarmEvent
 from pumpbench.faults import Faults
+from pumpbench.frames import Frames
 from pumpbench.identity import stated
 from pumpbench.outcome import measure
 from pumpbench.rewind import join
 from pumpbench.runfolder import RunFolder
-from pumpbench.trace import AlarmEvent, Signal, Trace, labels, signals
+from pumpbench.signals import frame_text, labels
+from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -197,21 +198,6 @@ def replay(run: Path | Outcome, **keys: Any) -> Replay:
 
     record = Record(run.title, run.frames, run.info) if isinstance(run, Outcome) else Record.load(Path(run))
     return play(record, **keys)
-
-
-def frame_text(frame: Frame) -> str:
-    """A frame in words: its message and signals in physical values, or its id and bytes if it is none of the DBC."""
-    message = codec.messages_by_id().get(frame.can_id)
-    if message is None or len(frame.data) != message.length:
-        what = "error frame" if frame.is_error else "remote frame" if frame.is_remote else "frame"
-        return f"{what} 0x{frame.identifier:X}{' (29 bits)' if frame.is_extended else ''} [{frame.data.hex(' ')}]"
-    table = signals(message.name)
-    words = [f"{name}={_value_text(table[name], raw)}" for name, raw in message.unpack(frame.data).items()]
-    return f"{message.name} {' '.join(words)}"
-
-
-def _value_text(signal: Signal, raw: int) -> str:
-    return signal.choices.get(raw) or signal.text(raw).replace(" ", "")
 
 
 @dataclass(eq=False, repr=False)

@@ -29,7 +29,8 @@ import firmware_sim
 import plant_server
 from plant_server.physiology import STATES
 from pumpbench import fork, rig
-from pumpbench.capture import Capture, read_candump, write_candump
+from pumpbench.candump import read_candump, write_candump
+from pumpbench.capture import Capture
 from pumpbench.identity import BUILT_IN
 from pumpbench.rewind import Diverged, RewoundPlant, before
 from pumpbench.rig.power import InProcess

@@ -11,7 +11,7 @@ from can.io.logger import MESSAGE_WRITERS
 from can.util import channel2int
 
 from can_bus.frame import to_message
-from pumpbench.capture import LogLine, read_lines
+from pumpbench.candump import LogLine, read_lines
 from pumpbench.runfolder import LOG
 
 SIMULATED_BEFORE: Final = 631152000.0

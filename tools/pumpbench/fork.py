@@ -12,14 +12,13 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-import dbc
 from can_bus.faults import Fault as WireFault
 from can_bus.faults import NodeFault, clock, seconds
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench import rig
-from pumpbench.capture import Frames
 from pumpbench.faults import AnyFault, Faults, load
-from pumpbench.identity import BUILT_IN, firmware_sha256
+from pumpbench.frames import Frames
+from pumpbench.identity import BUILT_IN, firmware_sha256, other_dbc
 from pumpbench.rewind import Origin
 from pumpbench.rig import Change, Request
 from pumpbench.runfolder import RunFolder
@@ -58,11 +57,9 @@ class Instant:
         """
         if info.get("free_running"):
             raise ForkError(f"{name} was a free run: no two of these are the same, so none can be forked")
-        if info.get("dbc_crc32") != f"{dbc.crc32():08x}":
-            raise ForkError(
-                f"{name} was recorded with another pumpbench.dbc: CRC-32 {info.get('dbc_crc32')}, "
-                f"this one {dbc.crc32():08x}"
-            )
+        foreign = other_dbc(info)
+        if foreign is not None:
+            raise ForkError(f"{name} {foreign}")
         try:
             time = seconds(at)
         except ValueError as error:

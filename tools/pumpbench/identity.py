@@ -33,6 +33,14 @@ def versions() -> dict[str, Any]:
     }
 
 
+def other_dbc(info: Mapping[str, Any]) -> str | None:
+    """What to say of a record, from its run.json, whose frames another DBC than this one gave their meaning."""
+    theirs, ours = info.get("dbc_crc32"), f"{dbc.crc32():08x}"
+    if theirs in (None, ours):
+        return None
+    return f"was recorded with another pumpbench.dbc: CRC-32 {theirs}, this one {ours}"
+
+
 def firmware_sha256(command: str | None) -> dict[str, str]:
     """SHA-256 of the firmware's files, by name.
 

@@ -10,7 +10,7 @@ from plant_server.metrics import glycaemic
 from pumpbench.hazards import Monitor
 
 if TYPE_CHECKING:
-    from pumpbench.capture import Frames
+    from pumpbench.frames import Frames
     from pumpbench.trace import Trace
 
 

@@ -25,7 +25,8 @@ from can_bus.link import Link
 from can_bus.lockstep import Phase
 from can_bus.url import BusUrlError, open_link
 from pumpbench import live
-from pumpbench.capture import Capture, read_candump
+from pumpbench.candump import read_candump
+from pumpbench.capture import Capture
 from pumpbench.identity import stated, versions
 from pumpbench.journal import NAMES
 from pumpbench.repair import repair

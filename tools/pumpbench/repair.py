@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pumpbench.capture import Frames, read_candump
+from pumpbench.candump import read_candump
+from pumpbench.frames import Frames
 from pumpbench.identity import stated
 from pumpbench.journal import read_journal, unused
 from pumpbench.runfolder import LOG, PARTIAL, RUN, RunFolder, RunFolderError

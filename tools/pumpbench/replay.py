@@ -24,7 +24,6 @@ from can_bus import codec
 from can_bus.faults import MemoryState, clock
 from can_bus.frame import MAX_DATA, Frame
 from plant_server.server import judge_version, stated_version
-from pumpbench.capture import FRAME_MICROSECONDS, Frames
 from pumpbench.comparison.align import Ignore, compare, contents
 from pumpbench.comparison.record import Record
 from pumpbench.comparison.report import Report
@@ -32,11 +31,13 @@ from pumpbench.conformance.connect import connected
 from pumpbench.conformance.device import Device
 from pumpbench.conformance.driver import Bench, Silent, Violation
 from pumpbench.conformance.registry import Need
+from pumpbench.frames import Frames, device_ids
 from pumpbench.identity import SOMEBODY_ELSES
 from pumpbench.rewind import boots_up
 from pumpbench.rig import RigError
 from pumpbench.rig.buses import SERIAL
-from pumpbench.trace import labels
+from pumpbench.signals import labels
+from pumpbench.turns import FRAME_MICROSECONDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -288,11 +289,6 @@ def _diagnostics() -> frozenset[int]:
     return frozenset(codec.message(name).can_id for name in ("UDS_Request", "UDS_Response"))
 
 
-@functools.cache
-def _said_by_device() -> frozenset[int]:
-    return frozenset(message.can_id for message in codec.messages().values() if message.sender == "CTRL")
-
-
 def turns_of(record: Record) -> list[Turn]:
     """Take a record apart into the turns of its device.
 
@@ -341,7 +337,7 @@ def _turn(record: Record, rows: list[int]) -> Turn | None:
 
 
 def _is_own(frames: Frames, row: int) -> bool:
-    return int(frames.can_id[row]) in _said_by_device()
+    return int(frames.can_id[row]) in device_ids()
 
 
 def _memory(record: Record, turn: Turn, following: list[Frame]) -> MemoryState:

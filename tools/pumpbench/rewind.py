@@ -20,7 +20,8 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Phase
 from plant_server.pump import NMT_BOOT_UP
 from plant_server.server import PlantServer, Run
-from pumpbench.capture import Frames, concatenated
+from pumpbench.frames import Frames, concatenated
+from pumpbench.signals import frame_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -211,8 +212,6 @@ def boots_up(frame: Frame) -> bool:
 
 
 def _text(frame: Frame | None) -> str:
-    from pumpbench.bench import frame_text  # noqa: PLC0415
-
     return "nothing" if frame is None else frame_text(frame)
 
 

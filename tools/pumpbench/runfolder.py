@@ -23,9 +23,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import dbc
 from pumpbench import journal
-from pumpbench.capture import Frames, read_candump, write_candump
+from pumpbench.candump import read_candump, write_candump
+from pumpbench.frames import Frames
+from pumpbench.identity import other_dbc
 from pumpbench.trace import PARQUET_NAME, Trace
 
 if TYPE_CHECKING:
@@ -239,12 +240,8 @@ class RunFolder:
         """Every frame, from bus.log, checked against the hash in run.json."""
         path, frames = self.path / LOG, self.logged
         if "trace_sha256" in self.info and frames.sha256() != self.info["trace_sha256"]:
-            theirs, ours = self.info.get("dbc_crc32"), f"{dbc.crc32():08x}"
-            if theirs not in (None, ours):
-                raise RunFolderError(
-                    f"{path} was recorded with another pumpbench.dbc: CRC-32 {theirs}, this one {ours}"
-                )
-            raise RunFolderError(f"{path} was changed: its frames do not have the hash that {RUN} states")
+            changed = f"was changed: its frames do not have the hash that {RUN} states"
+            raise RunFolderError(f"{path} {other_dbc(self.info) or changed}")
         return frames
 
     @functools.cached_property

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from pumpbench.trace import AlarmEvent, Trace, labels
+from pumpbench.events import AlarmEvent
+from pumpbench.signals import labels
+from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

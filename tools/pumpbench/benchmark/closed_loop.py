@@ -31,7 +31,7 @@ from pumpbench.benchmark.figure import Figure, figure
 from pumpbench.benchmark.round_trips import CEILING_OF, measure, round_trips, vcan_available
 from pumpbench.calibration import MODES
 from pumpbench.closed_loop import Case, simulate
-from pumpbench.trace import decode
+from pumpbench.signals import decode
 
 PATIENT = "adult#002"
 STRATEGY = "s2"

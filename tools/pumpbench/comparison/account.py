@@ -14,7 +14,9 @@ import numpy as np
 from can_bus import codec
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench.comparison.align import Comparison, Kind
-from pumpbench.trace import AlarmEvent, Trace, labels
+from pumpbench.events import AlarmEvent
+from pumpbench.signals import labels
+from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,7 +10,6 @@ renumbered and is no difference, any other is one.
 from __future__ import annotations
 
 import bisect
-import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
@@ -20,7 +19,7 @@ import numpy as np
 
 from can_bus import codec
 from can_bus.codec import COUNTER_MODULUS, CodecError
-from pumpbench.capture import Frames
+from pumpbench.frames import Frames, device_ids
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,7 +56,7 @@ class Ignore:
         Raises:
             CodecError: the DBC has no such message or signal.
         """
-        from pumpbench.trace import signals  # noqa: PLC0415
+        from pumpbench.signals import signals  # noqa: PLC0415
 
         messages, bits = set(), []
         for name in (part for given in names for part in (OWN if given == "own" else (given,))):
@@ -161,15 +160,10 @@ def compare(a: Frames, b: Frames, ignore: Ignore | None = None, channel: int | N
     return Comparison(a, b, differences, renumbered, (ours, theirs), one_sided, ignore)
 
 
-@functools.cache
-def _from_device() -> frozenset[int]:
-    return frozenset(message.can_id for message in codec.messages().values() if message.sender == "CTRL")
-
-
 def _order(a: Frames, b: Frames, difference: Difference) -> tuple[int, ...]:
     """When a frame was on the bus: instant, turn, the plant's side before the device, the sender's bus first."""
     frames, row = (a, difference.a) if difference.a is not None else (b, difference.b)
-    device, channel = int(frames.can_id[row]) in _from_device(), int(frames.channel[row])
+    device, channel = int(frames.can_id[row]) in device_ids(), int(frames.channel[row])
     return int(frames.step[row]), int(frames.turn[row]), device, channel if device else -channel, int(row or 0)
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import dbc
 from can_bus import codec
-from pumpbench.capture import Frames, read_candump
+from pumpbench.candump import read_candump
+from pumpbench.frames import Frames
+from pumpbench.identity import other_dbc
 from pumpbench.runfolder import RunFolder
 from pumpbench.trace import Trace
 
@@ -65,7 +66,5 @@ class Record:
     @property
     def foreign_dbc(self) -> str | None:
         """A warning, if its frames were written by another DBC than the one that decodes them."""
-        theirs, ours = self.info.get("dbc_crc32"), f"{dbc.crc32():08x}"
-        if theirs in (None, ours):
-            return None
-        return f"{self.name} was recorded with another pumpbench.dbc (CRC-32 {theirs}); {ours} decodes it here"
+        foreign = other_dbc(self.info)
+        return None if foreign is None else f"{self.name} {foreign}, which decodes it here"

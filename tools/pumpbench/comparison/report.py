@@ -12,11 +12,10 @@ import numpy as np
 from can_bus import codec
 from can_bus.faults import clock
 from can_bus.frame import Frame
-from pumpbench.bench import frame_text
 from pumpbench.comparison import account
 from pumpbench.comparison.align import Comparison, Difference, Ignore, Kind
 from pumpbench.comparison.record import Record
-from pumpbench.trace import Signal, signals
+from pumpbench.signals import Signal, frame_text, signals
 
 BEFORE: Final = 5
 """Frames shown before the first difference."""

@@ -22,8 +22,8 @@ from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, Done, Node, Phase
 from firmware_sim.calibration import parameter_names
 from plant_server.physiology import load_patient
-from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES, calibrate, with_crc
+from pumpbench.signals import frame_text
 
 NMA = MODES["nma"]
 

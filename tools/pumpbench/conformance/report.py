@@ -7,12 +7,12 @@ from typing import Any
 from xml.etree import ElementTree
 
 from can_bus.frame import Frame
-from pumpbench.bench import frame_text
 from pumpbench.conformance.registry import checks
 from pumpbench.conformance.requirements import Requirement, requirements
 from pumpbench.conformance.suite import Report, Result, Verdict
 from pumpbench.files import write_file
 from pumpbench.identity import versions
+from pumpbench.signals import frame_text
 
 SHOWN = 16
 """Frames before a failure that a report shows; the log has all."""

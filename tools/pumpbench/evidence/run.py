@@ -17,8 +17,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-import dbc
 from can_bus.lockstep import STEP_SECONDS
+from pumpbench.identity import other_dbc
 from pumpbench.outcome import measure
 from pumpbench.runfolder import FILES, RUN, RunFolder, RunFolderError, plain
 from pumpbench.story import AlarmSpan, alarm_spans, clock, state_changes
@@ -192,12 +192,10 @@ def load(path: Path) -> Evidence:
         problem = error.errors()[0]
         where = ".".join(map(str, problem["loc"]))
         raise RunFolderError(f"{path / RUN}: {where}: {problem['msg']} (found {problem['input']!r})") from None
-    ours = f"{dbc.crc32():08x}"
-    if info.dbc_crc32 not in (None, ours):
-        raise RunFolderError(
-            f"{path} was recorded with another pumpbench.dbc: CRC-32 {info.dbc_crc32}, this one {ours}; take the "
-            f"pumpbench that recorded it ({info.pumpbench or 'which it does not say'})"
-        )
+    foreign = other_dbc(folder.info)
+    if foreign is not None:
+        its = info.pumpbench or "which it does not say"
+        raise RunFolderError(f"{path} {foreign}; take the pumpbench that recorded it ({its})")
     files = tuple(_file(path / name) for name in FILES)
     frames = folder.logged
     if frames.sha256() != info.trace_sha256:

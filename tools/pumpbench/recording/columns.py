@@ -15,8 +15,10 @@ import numpy as np
 from can_bus import codec
 from can_bus.frame import CAN_EFF_FLAG, CAN_RTR_FLAG
 from can_bus.lockstep import STEP_SECONDS
-from pumpbench.capture import Frames
 from pumpbench.closeups import close_ups
+from pumpbench.events import FaultSpan
+from pumpbench.frames import Frames
+from pumpbench.signals import decode, signals
 from pumpbench.story import (
     BLUE,
     GREEN,
@@ -37,7 +39,7 @@ from pumpbench.story import (
     state_changes,
     without_reminders,
 )
-from pumpbench.trace import FaultSpan, Trace, decode, signals
+from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from pumpbench.capture import Frames
+from pumpbench.frames import Frames
 from pumpbench.recording.columns import log_run
 from pumpbench.recording.scene import PROPERTY, Scene
 from pumpbench.recording.tool import RecordingError, quiet_environment, rrd

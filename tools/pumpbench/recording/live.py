@@ -18,13 +18,15 @@ import numpy as np
 
 from can_bus import codec
 from can_bus.lockstep import STEP_SECONDS
-from pumpbench.capture import Frames, concatenated
+from pumpbench.events import FaultSpan
+from pumpbench.frames import Frames, concatenated
 from pumpbench.recording.columns import Colour, Run
 from pumpbench.recording.file import APPLICATION
 from pumpbench.recording.scene import PROPERTY, Scene
 from pumpbench.recording.tool import RecordingError
+from pumpbench.signals import decode
 from pumpbench.story import Note, notes, title
-from pumpbench.trace import FaultSpan, Trace, decode
+from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -15,7 +15,7 @@ from pumpbench.closeups import CloseUp, close_ups
 from pumpbench.story import LANES
 
 if TYPE_CHECKING:
-    from pumpbench.capture import Frames
+    from pumpbench.frames import Frames
     from pumpbench.trace import Trace
 
 PROPERTY: Final = "scene"

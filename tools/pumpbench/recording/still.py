@@ -30,7 +30,7 @@ from pumpbench.summary import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pumpbench.capture import Frames
+    from pumpbench.frames import Frames
     from pumpbench.recording.scene import Scene
     from pumpbench.trace import Trace
 

@@ -24,7 +24,7 @@ from can_bus.node_control import CommandControl, LineControl, attend
 from can_bus.url import open_link
 from plant_server.free_run import FreePlant, serve_free
 from plant_server.serve import serve
-from pumpbench.capture import write_candump
+from pumpbench.candump import write_candump
 from pumpbench.faults import write_wire
 from pumpbench.identity import SOMEBODY_ELSES
 from pumpbench.rig.buses import Buses

@@ -7,13 +7,13 @@ from typing import Final
 from can_bus import codec
 from can_bus.frame import Frame
 from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Phase
-from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES
 from pumpbench.conformance.boluses import COMMIT, carbs_mode
 from pumpbench.conformance.driver import GLUCOSE, Bench, Op, expect
 from pumpbench.conformance.loop import Loop, Values
 from pumpbench.conformance.registry import Dut, check
 from pumpbench.conformance.situations import difference, idle_boluses
+from pumpbench.signals import frame_text
 
 REQUEST: Final = codec.message("UDS_Request")
 RESPONSE: Final = codec.message("UDS_Response")

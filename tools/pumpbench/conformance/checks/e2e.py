@@ -10,7 +10,6 @@ from can_bus import codec
 from can_bus.codec import COUNTER_MODULUS, Check, Receiver
 from can_bus.frame import CAN_EFF_FLAG, CAN_RTR_FLAG, MAX_DATA, Frame
 from can_bus.lockstep import STEP_SECONDS, STEPS_PER_DAY, Node, Phase
-from pumpbench.bench import frame_text
 from pumpbench.calibration import MODES
 from pumpbench.conformance.boluses import carbs_mode
 from pumpbench.conformance.driver import (
@@ -28,6 +27,7 @@ from pumpbench.conformance.driver import (
 from pumpbench.conformance.loop import Values
 from pumpbench.conformance.registry import Dut, check
 from pumpbench.conformance.situations import difference, expect_unused, whole_batch
+from pumpbench.signals import frame_text
 
 PROTECTED: Final = tuple(each.name for each in HEARD_BY_CTRL if codec.message(each.name).data_ids is not None)
 
