@@ -18,8 +18,9 @@ from pathlib import Path
 import psutil
 import pytest
 from conftest import ROOT, Pumpbench
-from pumpbench import doctor, wiring
-from pumpbench.checkup import Mark, Request
+from pumpbench.doctor import examine as doctor
+from pumpbench.doctor import wiring
+from pumpbench.doctor.checkup import Mark, Request
 from serial_cable import cable
 from test_rig_failures import leftovers
 

@@ -7,7 +7,8 @@ from functools import cache
 import pytest
 from bench import S2, Bench, calibration
 from pumpbench.calibration import MODES
-from pumpbench.hazards import CGM_LOST, Monitor
+from pumpbench.hazards import Monitor
+from pumpbench.hazards.monitor import CGM_LOST
 
 import firmware_sim.ladder
 from can_bus import codec

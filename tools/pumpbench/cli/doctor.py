@@ -34,8 +34,8 @@ def doctor(
 
     from rich.text import Text  # noqa: PLC0415
 
-    from pumpbench.checkup import Mark, Request  # noqa: PLC0415
-    from pumpbench.doctor import examine  # noqa: PLC0415
+    from pumpbench.doctor.checkup import Mark, Request  # noqa: PLC0415
+    from pumpbench.doctor.examine import examine  # noqa: PLC0415
     from pumpbench.files import write_file  # noqa: PLC0415
 
     if bus.startswith("inproc"):

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import dbc
 from can_bus.lockstep import STEPS_PER_DAY, Done
 from plant_server.server import judge_version, stated_version
-from pumpbench import wiring
-from pumpbench.ears import Ears
+from pumpbench.doctor import wiring
+from pumpbench.doctor.ears import Ears
 
 DBC_CRC_IS = bytes.fromhex("07 62 01 01")
 """The start of a UDS answer with identifier 0101, as a single frame of ISO-TP (docs/diagnostics.md)."""

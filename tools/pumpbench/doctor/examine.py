@@ -1,6 +1,6 @@
-"""Is a device wired right, and does it speak the protocol? One check after the other, in words.
+"""The doctor's visit to a device, from opening the bus to the report.
 
-The doctor plays a short run with the plant itself (`plant_server.server.PlantServer`): roll call, calibration, some
+He plays a short run with the plant itself (`plant_server.server.PlantServer`): roll call, calibration, some
 steps, the end. Beside the plant, which has to overlook what a device does wrong, it listens with ears of its own and
 keeps count. After every answer it waits a moment, so that what is said behind SYNC_Done is heard as such.
 """
@@ -26,9 +26,10 @@ from can_bus.slcan import SlcanLink
 from can_bus.url import open_link
 from plant_server.serve import ROLL_CALL_EVERY
 from plant_server.server import PlantError, PlantServer
-from pumpbench import rig, wiring
-from pumpbench.checkup import Check, Heard, Latency, Mark, Request, Stage, judge
-from pumpbench.ears import Ears
+from pumpbench import rig
+from pumpbench.doctor import wiring
+from pumpbench.doctor.checkup import Check, Heard, Latency, Mark, Request, Stage, judge
+from pumpbench.doctor.ears import Ears
 
 QUIET = 0.02
 """Seconds of silence after SYNC_Done that show that the turn is over."""
