@@ -96,7 +96,7 @@ def run_of(case: Case) -> Run:
         scenario = load_scenario(scenario, seed=case.seed, patient=patient.name, days=case.days)
     sensor = load_sensor(case.sensor) if isinstance(case.sensor, str) else case.sensor
     tuning = case.tuning or tuning_for(case.mode, noisy=not isinstance(sensor.model, Ideal))
-    flashed = calibrate(patient, tuning, case.controller)
+    flashed = calibrate(patient, tuning, case.model)
     return Run(
         patient, scenario, round(DAY * case.days), case.seed, MODES[case.mode], flashed, sensor, case.variability
     )
@@ -247,9 +247,7 @@ def test_reservoirs_that_run_empty() -> None:
     controller = shipped_models()["adult#008"]._replace(carb_ratio=4.0)
     tuning = Tuning(pram_bolus=120.0)
     scenario = feast(4, 500.0, told_percent=-70.0)
-    result, acks = the_same(
-        Case("adult#008", mode="s3", scenario=scenario, days=3.4, controller=controller, tuning=tuning)
-    )
+    result, acks = the_same(Case("adult#008", mode="s3", scenario=scenario, days=3.4, model=controller, tuning=tuning))
     assert (AckFor.INSULIN_BOLUS_PROGRAM, AckResult.OVER_LIMIT) in acks
     assert (AckFor.CANCEL, AckResult.ACCEPTED) in acks
     assert not result.strokes[3 * DAY - 6 : 3 * DAY].any()
@@ -278,7 +276,7 @@ def test_what_a_new_reservoir_holds() -> None:
 def test_a_patient_of_ones_own_and_other_physiology() -> None:
     patient = replace(load_patient("adult#010", pramlintide="P4", physiology="S2013"), name="somebody")
     controller: ControllerModel = shipped_models()["adult#001"]
-    result, _ = the_same(Case(patient, mode="s4", scenario="camerlingo", days=1, controller=controller, seed=0))
+    result, _ = the_same(Case(patient, mode="s4", scenario="camerlingo", days=1, model=controller, seed=0))
     by_name, _ = the_same(Case("adult#010", mode="s4", scenario="camerlingo", physiology="S2013", pramlintide="P4"))
     assert (result.glucose != by_name.glucose).any()
 
@@ -444,7 +442,7 @@ def test_its_speed_is_a_figure_of_the_benchmark() -> None:
             r"sensor: effects \(stuck\) need the bus",
         ),
         (
-            Case("adult#001", controller=shipped_models()["adult#001"]._replace(carb_ratio=0.5)),
+            Case("adult#001", model=shipped_models()["adult#001"]._replace(carb_ratio=0.5)),
             r"the device would not accept CfgCarbRatio \(CfgIndex \d+\): raw 50",
         ),
     ],

@@ -98,6 +98,14 @@ class Job:
     series: bool = False
 
     @property
+    def shared(self) -> dict[str, Any]:
+        """What the compiled loop (`Case`) and the rig (`Request`) call by the same names."""
+        names = (
+            "patient", "seed", "scenario", "sensor", "pramlintide", "variability", "physiology", "tuning", "model",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def key(self) -> str:
         """Of the result: everything that has a part in it, and the programs."""
         parts = {**dataclasses.asdict(self), "programs": programs()}
@@ -209,21 +217,7 @@ def _compiled(job: Job) -> tuple[dict[str, Any], dict[str, Any]]:
     """The run as the compiled loop does it."""
     from pumpbench.closed_loop import Case, simulate  # noqa: PLC0415
 
-    result = simulate(
-        Case(
-            patient=job.patient,
-            mode=job.mode,
-            scenario=job.scenario,
-            seed=job.seed,
-            days=job.days,
-            sensor=job.sensor,
-            variability=job.variability,
-            pramlintide=job.pramlintide,
-            physiology=job.physiology,
-            tuning=job.tuning,
-            controller=job.model,
-        )
-    )
+    result = simulate(Case(mode=job.mode, days=job.days, **job.shared))
     if not job.series:
         return result.metrics(), {}
     cgm = np.where(result.cgm <= CGM_MAX_RAW, result.cgm * 0.1, np.nan)
@@ -237,21 +231,8 @@ def _on_bus(job: Job, via: str) -> tuple[dict[str, Any], dict[str, Any]]:
     from pumpbench.runfolder import RunFolder  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory(prefix="pumpbench-") as directory:
-        request = rig.Request(
-            patient=job.patient,
-            out=Path(directory) / "run",
-            strategy=job.mode,
-            scenario=job.scenario,
-            steps=job.days * STEPS_PER_DAY,
-            seed=job.seed,
-            bus=via,
-            sensor=job.sensor,
-            physiology=job.physiology,
-            pramlintide=job.pramlintide,
-            variability=job.variability,
-            tuning=job.tuning,
-            model=job.model,
-        )
+        out, steps = Path(directory) / "run", job.days * STEPS_PER_DAY
+        request = rig.Request(out=out, strategy=job.mode, steps=steps, bus=via, **job.shared)
         folder = rig.execute(rig.prepare(request))
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         trace = RunFolder.load(folder).trace

@@ -66,7 +66,7 @@ class Case:
         pramlintide: parameter set of a patient given by name; None = P2.
         physiology: of a patient given by name; None = what its file says.
         tuning: None = that of the mode (`pumpbench.calibration.tuning_for`).
-        controller: what the controller knows of the patient; None = the model that comes with the package.
+        model: what the controller knows of the patient; None = the model that comes with the package.
     """
 
     patient: str | Patient
@@ -79,7 +79,7 @@ class Case:
     pramlintide: str | None = None
     physiology: str | None = None
     tuning: Tuning | None = None
-    controller: ControllerModel | None = None
+    model: ControllerModel | None = None
 
     @property
     def steps(self) -> int:
@@ -113,7 +113,7 @@ def prepare(case: Case) -> Plan:
         raise CaseError(f"sensor: effects ({sensor.effects[0].kind}) need the bus; the compiled loop has none")
     mode = MODES[case.mode]
     tuning = case.tuning or tuning_for(case.mode, noisy=not isinstance(sensor.model, Ideal))
-    law, limits = _calibration(_Key(patient), tuning, case.controller)
+    law, limits = _calibration(_Key(patient), tuning, case.model)
     meals = tuple(meal for meal in scenario.meals if meal.step < steps)
     if any(meal.step < 0 for meal in meals):
         raise CaseError(f"scenario {scenario.name}: a meal starts before the run")
