@@ -29,10 +29,10 @@ from live_bus import (
     verifies,
     viewer,
 )
-from pumpbench import recorder
 from pumpbench.candump import read_candump
 from pumpbench.capture import Capture
-from pumpbench.repair import repair
+from pumpbench.recorder import __main__ as recorder
+from pumpbench.recorder.repair import repair
 from pumpbench.rig import Request, RigError, prepare
 from pumpbench.runfolder import RunFolder, RunFolderError
 from pumpbench.trace import Trace

@@ -8,8 +8,8 @@
     summary.png       the same as one picture
 
 A folder is written under the name `<out>.partial` and renamed at the end: a folder without `.partial` is complete.
-While the run is on it holds run.json, a journal of the frames (`pumpbench.journal`) and, of a run that is watched, a
-recording that grows; `pumpbench.repair` makes the rest of them.
+While the run is on it holds run.json, a journal of the frames (`pumpbench.recorder.journal`) and, of a run that is
+watched, a recording that grows; `pumpbench.recorder.repair` makes the rest of them.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pumpbench import journal
 from pumpbench.candump import read_candump, write_candump
 from pumpbench.frames import Frames
 from pumpbench.identity import other_dbc
+from pumpbench.recorder import journal
 from pumpbench.trace import PARQUET_NAME, Trace
 
 if TYPE_CHECKING:

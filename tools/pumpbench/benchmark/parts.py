@@ -22,7 +22,7 @@ from pumpbench import rig
 from pumpbench.benchmark.figure import Figure, figure
 from pumpbench.capture import Capture
 from pumpbench.closed_loop import Case, simulate
-from pumpbench.recorder import write
+from pumpbench.recorder.writing import write
 from pumpbench.runfolder import RunFolder
 
 PATIENT = "adult#002"

@@ -27,7 +27,7 @@ def gateway(context: typer.Context) -> None:
 
 def record(context: typer.Context) -> None:
     """Record a bus into a run folder, next to firmware it knows nothing about."""
-    from pumpbench.recorder import main as node  # noqa: PLC0415
+    from pumpbench.recorder.__main__ import main as node  # noqa: PLC0415
 
     raise typer.Exit(node(context.args))
 

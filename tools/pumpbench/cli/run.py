@@ -76,7 +76,8 @@ def run(
 ) -> None:
     """Run the closed loop: patient, firmware and recorder on one bus. Exit status 1 if a hazard was counted."""
     from can_bus.lockstep import STEPS_PER_DAY  # noqa: PLC0415
-    from pumpbench import live, rig  # noqa: PLC0415
+    from pumpbench import rig  # noqa: PLC0415
+    from pumpbench.recorder import live  # noqa: PLC0415
 
     how: dict[str, Any] = {
         "device_bus": device_bus,

@@ -118,8 +118,8 @@ def _newest() -> Path:
 
 def _recording(path: Path) -> Path:
     """The recording of what was named; what a killed recorder left is made readable first."""
-    from pumpbench.journal import NAMES  # noqa: PLC0415
-    from pumpbench.repair import repair  # noqa: PLC0415
+    from pumpbench.recorder.journal import NAMES  # noqa: PLC0415
+    from pumpbench.recorder.repair import repair  # noqa: PLC0415
     from pumpbench.runfolder import PARTIAL, RECORDING, RunFolder  # noqa: PLC0415
 
     if path.is_file():

@@ -10,7 +10,7 @@ nodes in this process, the same frames, no wake-ups (`in_process`).
 from pathlib import Path
 
 from pumpbench.capture import Capture
-from pumpbench.recorder import write
+from pumpbench.recorder.writing import write
 from pumpbench.rig.in_process import Wires, simulate, wires
 from pumpbench.rig.on_bus import firmware_command, run_on_bus
 from pumpbench.rig.processes import Child, NodeDied, one_cpu

@@ -15,12 +15,12 @@ from plant_server.sensor import load_sensor
 from plant_server.sensors.ideal import Ideal
 from plant_server.server import PlantServer, Run
 from plant_server.user import Plan
-from pumpbench import live
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
 from pumpbench.controller_model import ControllerModel, model_of
 from pumpbench.faults import Faults
 from pumpbench.faults import load as load_fault_file
 from pumpbench.identity import BUILT_IN, SOMEBODY_ELSES, firmware_sha256, versions
+from pumpbench.recorder import live
 from pumpbench.rewind import Origin
 
 

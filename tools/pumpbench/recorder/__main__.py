@@ -1,132 +1,29 @@
-"""The recorder: a passive node that turns what it hears on the bus into a run folder.
-
-It listens to the device's bus, and to the plant's as well when a gateway lies between, from before the roll call until
-the plant has closed the run. It never sends and nobody waits for it. What it hears goes to the disk at once
-(`pumpbench.journal`); only at the end does it analyse and import what draws. Who wants to watch gets another process
-(`pumpbench.live`).
-"""
+"""The recorder's command line: `pumpbench record`, and `python -m pumpbench.recorder` for the rig."""
 
 import argparse
 import contextlib
 import json
-import select
 import signal
 import socket
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import can
 
-from can_bus import codec
-from can_bus.link import Link
-from can_bus.lockstep import Phase
+import pumpbench.recorder
 from can_bus.url import BusUrlError, open_link
-from pumpbench import live
 from pumpbench.candump import read_candump
 from pumpbench.capture import Capture
-from pumpbench.identity import stated, versions
-from pumpbench.journal import NAMES
-from pumpbench.repair import repair
-from pumpbench.rewind import Diverged, Origin, join
+from pumpbench.identity import versions
+from pumpbench.recorder import live
+from pumpbench.recorder.journal import NAMES
+from pumpbench.recorder.listening import listen
+from pumpbench.recorder.repair import repair
+from pumpbench.recorder.writing import write
+from pumpbench.rewind import Diverged, Origin
 from pumpbench.runfolder import NotWritten, RunFolder, RunFolderError
-
-COALESCE_SECONDS = 0.005
-"""On a hub nothing is lost while we sleep, and one wake-up then fetches many frames."""
-
-
-class Ending:
-    """Knows from the frames of one bus when the run is over: SYNC_Done after SYNC_Step(End).
-
-    Args:
-        free_running: the device does not answer; SYNC_Step(End) is the end.
-    """
-
-    def __init__(self, *, free_running: bool = False) -> None:
-        self._free_running = free_running
-        self._step_id = codec.message("SYNC_Step").can_id
-        self._done_id = codec.message("SYNC_Done").can_id
-        self._ending = False
-        self.over = False
-
-    def watch(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Look at frames in passing."""
-        for can_id, data in frames:
-            if can_id == self._step_id and len(data) == 8:
-                self._ending = data[1] >> 4 == Phase.END
-                self.over |= self._ending and self._free_running
-            elif can_id == self._done_id and self._ending:
-                self.over = True
-
-
-def listen(
-    links: Sequence[Link], capture: Capture, watch: Mapping[int, Callable[[], bool]], *, free_running: bool = False
-) -> bool:
-    """Collect frames until the run is over on every bus; False if told to end before.
-
-    Args:
-        links: the buses, the device's first.
-        capture: gets the frames.
-        watch: other descriptors, and what to do once one of them becomes readable; True ends the recording.
-        free_running: the device answers no token.
-
-    Raises:
-        BusLost: a bus is gone or frames were lost.
-        NotWritten: a frame could not be kept.
-    """
-    endings = [Ending(free_running=free_running) for _ in links]
-    buses = {link.fileno(): channel for channel, link in enumerate(links)}
-    others = dict(watch)
-    lossless = all(link.url.startswith(("unix:", "tcp:", "inproc:")) for link in links)
-
-    def collect(channel: int) -> None:
-        frames = links[channel].recv(0)
-        capture.extend(channel, frames)
-        endings[channel].watch(frames)
-
-    while buses:
-        ready, _, _ = select.select([*buses, *others], [], [])
-        told = [others.pop(descriptor)() for descriptor in ready if descriptor in others]
-        stop = any(told)
-        for descriptor, channel in list(buses.items()):
-            if descriptor in ready or stop:
-                collect(channel)
-            if endings[channel].over:  # this bus may be closed now while the other one still talks
-                del buses[descriptor]
-        if stop:
-            return not buses
-        if lossless:
-            time.sleep(COALESCE_SECONDS)
-    return True
-
-
-def write(
-    folder: RunFolder, capture: Capture, info: dict[str, Any], *, complete: bool, origin: Origin | None = None
-) -> None:
-    """Analyse what was collected and write the run folder; an incomplete run keeps its `.partial` name.
-
-    Raises:
-        RunFolderError: the folder could not be written.
-        Diverged: the run did not begin as its origin did; it keeps its `.partial` name too.
-    """
-    from pumpbench.outcome import measure  # noqa: PLC0415
-    from pumpbench.trace import Trace  # noqa: PLC0415
-
-    info = info | {"device": stated(capture.device_info())}
-    frames = capture.finish()
-    if not complete:
-        folder.write_partial(frames, info)
-        return
-    if origin is not None:
-        try:
-            frames = join(origin, frames)
-        except Diverged:
-            folder.write_partial(frames, info)
-            raise
-    trace = Trace.from_frames(frames, info)
-    folder.write_all(frames, info, measure(trace, frames), trace)
 
 
 @contextlib.contextmanager
@@ -147,7 +44,7 @@ def _signals() -> Iterator[int]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; exit status 0 recorded to the end or asked to end, 2 wrong usage, 3 the bus or the disk failed."""
-    parser = argparse.ArgumentParser(prog="pumpbench record", description=__doc__)
+    parser = argparse.ArgumentParser(prog="pumpbench record", description=pumpbench.recorder.__doc__)
     parser.add_argument("--bus", metavar="URL", help="the device's bus")
     parser.add_argument("--plant-bus", metavar="URL", help="the plant's bus, when a gateway lies between")
     parser.add_argument("--out", type=Path, metavar="DIR", help="the run folder to write")

@@ -26,7 +26,7 @@ from urllib.parse import quote
 
 from can_bus.frame import RECORD_SIZE
 from pumpbench.capture import Follower, NewRun
-from pumpbench.journal import NAMES
+from pumpbench.recorder.journal import NAMES
 from pumpbench.runfolder import PARTIAL, RECORDING, RUN, RunFolder
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class View:
     """
 
     def __init__(self, folder: Path, channels: int, port: int, web_port: int | None) -> None:
-        command = [sys.executable, "-m", "pumpbench.live", str(folder), "--port", str(port)]
+        command = [sys.executable, "-m", "pumpbench.recorder.live", str(folder), "--port", str(port)]
         command += ["--channels", str(channels)]
         command += ["--web", str(web_port)] if web_port is not None else []
         self._process = subprocess.Popen(
@@ -180,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from pumpbench.recording.page import Page  # noqa: PLC0415
     from pumpbench.recording.tool import RecordingError  # noqa: PLC0415
 
-    parser = argparse.ArgumentParser(prog="pumpbench.live", description=__doc__)
+    parser = argparse.ArgumentParser(prog="pumpbench.recorder.live", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--channels", type=int, required=True)
@@ -212,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             taken = [str(frames + before) for frames, before in zip(error.taken, skip, strict=True)]
             command = ["--port", str(options.port), "--channels", str(channels), "--skip", *taken]
             command += ["--web", str(options.web)] if options.web is not None else []
-            os.execv(sys.executable, [sys.executable, "-m", "pumpbench.live", str(options.folder), *command])
+            os.execv(sys.executable, [sys.executable, "-m", "pumpbench.recorder.live", str(options.folder), *command])
         except RecordingError as error:
             partial = RunFolder(options.folder.with_name(options.folder.name.removesuffix(PARTIAL)))
             print(f"error {partial.failed(RECORDING, error)}", flush=True)

@@ -9,7 +9,7 @@ from typing import Any
 from pumpbench.candump import read_candump
 from pumpbench.frames import Frames
 from pumpbench.identity import stated
-from pumpbench.journal import read_journal, unused
+from pumpbench.recorder.journal import read_journal, unused
 from pumpbench.runfolder import LOG, PARTIAL, RUN, RunFolder, RunFolderError
 
 
