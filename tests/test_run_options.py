@@ -1,13 +1,11 @@
 """What varies, which equations, which pramlintide: from the command line into the plant and into run.json."""
 
-import importlib
 import json
 from pathlib import Path
 
 import pytest
 from conftest import Pumpbench
 from pumpbench import rig
-from pumpbench.cli.statuses import STATUS_OF
 
 from plant_server.physiology import SOURCES, PatientError, load_patient
 from plant_server.physiology import parameters as par
@@ -141,10 +139,3 @@ def test_patients_of_an_own_file_run_with_models_identified_from_them(pumpbench:
     wrong = pumpbench("run", "--patient", "adult#001", *arguments)
     assert wrong.returncode == 2
     assert "no model of patient 'adult#001'; it has adult#003, adult#007" in wrong.stderr
-
-
-def test_every_error_with_an_exit_status_is_a_class_there_is() -> None:
-    """They are named, not imported: a class that moves must not end in a traceback."""
-    for name in STATUS_OF:
-        module, _, kind = name.rpartition(".")
-        assert issubclass(getattr(importlib.import_module(module), kind), Exception), name

@@ -2,12 +2,12 @@
 
 import base64
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from html_page import Page
 from matplotlib.image import imread
 from pumpbench.study import figures, paper, report, selection, statistics
 from study_results import synthetic_runs
@@ -31,46 +31,6 @@ def made_up_curves(
         for mode in modes
         for seed in seeds
     }  # fmt: skip
-
-
-class Page(HTMLParser):
-    """Checks nesting; collects tables as lists of rows, ids, links and sources."""
-
-    VOID = frozenset({"meta", "img", "br"})
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tables: list[list[list[str]]] = []
-        self.ids: set[str] = set()
-        self.addresses: list[str] = []
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        known = dict(attrs)
-        if "id" in known:
-            self.ids.add(str(known["id"]))
-        self.addresses += [str(known[name]) for name in ("src", "href") if name in known]
-        if tag not in self.VOID:
-            self.open.append(tag)
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if {"td", "th"} & set(self.open):
-            self.tables[-1][-1][-1] += data
-
-    def table(self, *heading: str) -> list[list[str]]:
-        """The rows of the first table whose headings begin so."""
-        return next(table[1:] for table in self.tables if table and table[0][: len(heading)] == list(heading))
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +57,8 @@ def test_the_report_is_one_file_without_requests(full: Path) -> None:
     text = full.read_text(encoding="utf-8")
     page = Page(text)
     assert not re.search(r"https?://|@import|url\(|<script|<link", text)
-    internal = {address[1:] for address in page.addresses if address.startswith("#")}
-    assert internal == page.ids
-    images = [address for address in page.addresses if not address.startswith("#")]
+    assert {link.removeprefix("#") for link in page.links} == set(page.ids)
+    images = [str(image["src"]) for image in page.images]
     assert len(images) == 7
     for image in images:
         assert base64.b64decode(image.removeprefix("data:image/png;base64,"), validate=True)[:8] == b"\x89PNG\r\n\x1a\n"

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from pumpbench.cli.options import Strategy
 from pumpbench.cli.terminal import EXIT_DEAD, EXIT_USAGE, EXIT_WRONG, Failed, console, errors
 
 
@@ -22,7 +23,7 @@ def doctor(
         ),
     ] = None,
     host: Annotated[bool, typer.Option(help="Serve --bus as a hub, from this process.")] = False,
-    strategy: Annotated[str, typer.Option(help="Mode to ask for: nma, sma, ma, s1, s2, s3, s4.")] = "nma",
+    strategy: Annotated[str, typer.Option(help=f"Mode to ask for: {', '.join(Strategy)}.")] = Strategy.NMA,
     steps: Annotated[int, typer.Option(help="Sampling instants to play.", min=1)] = 20,
     timeout: Annotated[float, typer.Option(help="Seconds to wait for an answer.", min=0.1)] = 10.0,
     json_file: Annotated[

@@ -10,11 +10,11 @@ from pumpbench.cli.terminal import EXIT_USAGE, Failed
 
 
 class Strategy(StrEnum):
-    """The paper's seven modes: `pumpbench.calibration.MODES`, which takes seconds to import."""
+    """The paper's seven modes, as in `pumpbench.calibration.MODES`, which takes too long to import for --help."""
 
     NMA = "nma"
-    SMA = "sma"
     MA = "ma"
+    SMA = "sma"
     S1 = "s1"
     S2 = "s2"
     S3 = "s3"
