@@ -370,7 +370,15 @@ def test_cantools_decodes_the_log(tmp_path: Path, frames: Frames) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["rubbish", "(1.0) can0 100#0", "(1.0) can0 100#001122334455667788", "(x) can0 1#", "(1.0) can0 1##100"]
+    "line",
+    [
+        "rubbish",
+        "(1.0) can0 100#0",
+        "(1.0) can0 100",
+        "(1.0) can0 100#001122334455667788",
+        "(x) can0 1#",
+        "(1.0) can0 1##100",
+    ],
 )
 def test_a_broken_log_names_the_line(tmp_path: Path, line: str) -> None:
     path = tmp_path / "bus.log"

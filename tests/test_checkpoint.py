@@ -128,6 +128,8 @@ def header_with(**entries: Any) -> Callable[[Path], None]:
         (lambda folder: (folder / "checkpoint.json").write_text("{"), "checkpoint.json is damaged"),
         (lambda folder: (folder / "checkpoint.json").write_text("[]"), "checkpoint.json is damaged"),
         (lambda folder: (folder / "checkpoint.json").write_text("{}"), "checkpoint.json is damaged: 'format'"),
+        (header_with(files=[]), "checkpoint.json is damaged"),
+        (header_with(files={}), "checkpoint.json is damaged: 'bus.log'"),
         (lambda folder: (folder / "state.json").write_text("{}"), "state.json was changed: it does not have the hash"),
         (lambda folder: (folder / "memory.bin").unlink(), "memory.bin: No such file or directory"),
         (lambda folder: (folder / "bus.log").write_text(""), "bus.log was changed"),

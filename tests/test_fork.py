@@ -1,6 +1,8 @@
 """Runs that begin as a recorded one: the same bytes when nothing is changed, and what may be changed from then on."""
 
 import itertools
+import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +60,12 @@ def disturbed() -> Outcome:
 @pytest.fixture(scope="module")
 def plain() -> Outcome:
     return bench.run(strategy="s4", scenario="six-hours", hours=6)
+
+
+@pytest.fixture(scope="module")
+def written(plain: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the plain run."""
+    return replace(plain).write(tmp_path_factory.mktemp("plain") / "whole")
 
 
 def step(at: str) -> int:
@@ -395,24 +403,24 @@ def test_whoever_takes_over_has_counted_its_own_frames(lost: Outcome, tmp_path: 
         (["whole@03:00", "--scenario", "nowhere"], "there is no scenario 'nowhere'"),
         (["foreign@03:00"], "was recorded with another pumpbench.dbc: CRC-32 00000000"),
         (["free@03:00"], "was a free run"),
+        (["heard@03:00"], "heard: its run.json does not say how long the run was"),
     ],
 )
 def test_one_line_says_what_is_wrong(
-    plain: Outcome, pumpbench: Pumpbench, runs: Path, arguments: list[str], text: str
+    written: Path, pumpbench: Pumpbench, runs: Path, arguments: list[str], text: str
 ) -> None:
-    write = {
-        "changed": {},
-        "foreign": {"dbc_crc32": "00000000"},
-        "free": {"free_running": True},
-    }
     name = arguments[0].partition("@")[0]
-    Outcome(plain.frames, plain.trace, plain.metrics, None, {**plain.info, **write.get(name, {})}).write(
-        runs / (name if name in write else "whole")
-    )
-    (runs / "cut.partial").mkdir()
-    log = runs / "changed" / "bus.log"
-    if log.exists():
+    whole = runs / (name if name in ("changed", "foreign", "free", "heard") else "whole")
+    shutil.copytree(written, whole)
+    info = json.loads((whole / "run.json").read_text())
+    info |= {"foreign": {"dbc_crc32": "00000000"}, "free": {"free_running": True}}.get(name, {})
+    if name == "heard":
+        del info["steps"]
+    (whole / "run.json").write_text(json.dumps(info))
+    if name == "changed":
+        log = whole / "bus.log"
         log.write_text(log.read_text().replace("\n", "\n(0.000001) can0 7FF#\n", 1))
+    (runs / "cut.partial").mkdir()
     fault_file(runs, [faults.drop("CGM_Reading", start="02:55")])
     done = pumpbench("run", "--from", *arguments, "--out", "fork")
     assert done.returncode == 2, done.stdout + done.stderr

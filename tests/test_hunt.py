@@ -11,7 +11,8 @@ from conftest import Pumpbench
 from pumpbench import faults, hunt
 from pumpbench.faults import KINDS
 from pumpbench.hunt import CASES, Found, HuntError, Log, Settings, as_test, case, shrink
-from pumpbench.probe import Probe, Verdict, jobs_or
+from pumpbench.parallel import cpus
+from pumpbench.probe import Probe, Verdict
 
 CASES_HUNTED = 10_000 if os.environ.get("PUMPBENCH_NIGHTLY") else 60
 
@@ -49,7 +50,7 @@ def test_every_kind_is_drawn_and_every_fault_acts_within_the_run() -> None:
 
 
 def test_a_hunt_for_the_reference_firmware_catches_nothing(tmp_path: Path) -> None:
-    result = hunt.run(Settings(tmp_path, CASES_HUNTED, jobs=jobs_or(None)))
+    result = hunt.run(Settings(tmp_path, CASES_HUNTED, jobs=cpus()))
     failed = [entry for entry in lines(tmp_path)[1:] if entry["hazards"] or entry["error"]]
     assert failed == [] and result.failed == 0
     assert result.injected > CASES_HUNTED
@@ -147,6 +148,20 @@ def test_a_hunt_goes_on_where_it_was_cut_off(tmp_path: Path, monkeypatch: pytest
     told: list[tuple[int, int]] = []
     assert hunt.run(Settings(tmp_path / "cut", 20), told=lambda done, of: told.append((done, of))) == whole
     assert told[0] == (12, 20) and told[-1] == (20, 20)
+    assert sorted(Log(tmp_path / "cut", lines(tmp_path / "cut")[0]).done) == list(range(20))
+
+
+def test_a_hunt_that_was_cut_off_in_its_first_line_begins_anew(tmp_path: Path) -> None:
+    (tmp_path / CASES).write_text('{"seed": 1, "mo')
+    log = Log(tmp_path, {"seed": 2})
+    log.add(0, CLEAN)
+    assert sorted(Log(tmp_path, {"seed": 2}).done) == [0]
+
+
+def test_a_line_that_is_no_verdict_is_named(tmp_path: Path) -> None:
+    (tmp_path / CASES).write_text('{"seed": 1}\nrubbish\n')
+    with pytest.raises(HuntError, match=r"cases\.jsonl:2: not a verdict: 'rubbish'"):
+        Log(tmp_path, {"seed": 1})
 
 
 def test_the_folder_of_another_hunt_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -359,12 +359,20 @@ def test_a_busy_port_is_said_before_anything_else(option: str, runs: Path, pumpb
         (["--bus", "unix:x", "--out", "x", "--serve", "99999"], "a port is 1 to 65535"),
         (["--bus", "unix:x.sock", "--out", "x"], "no hub is serving there"),
         (["--bus", "wifi", "--out", "x"], "'wifi'"),
+        (
+            ["--bus", "unix:x", "--out", "x", "--info", "../list.json"],
+            "expected a JSON object, as run.json has, found []",
+        ),
+        (["--bus", "unix:x", "--out", "x", "--info", "../text"], "--info ../text is no JSON"),
     ],
 )
 def test_wrong_usage(
     arguments: list[str], text: str, runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(runs)
+    (runs / "list.json").write_text("[]")
+    (runs / "text").write_text("firmware: mine\n")
+    (runs / "empty").mkdir()
+    monkeypatch.chdir(runs / "empty")
     try:
         status = recorder.main(arguments)
     except SystemExit as ended:  # argparse
@@ -372,7 +380,7 @@ def test_wrong_usage(
         status = 2
     assert status == 2
     assert text in capsys.readouterr().err
-    assert not list(runs.iterdir())
+    assert not list(Path.cwd().iterdir())
 
 
 def test_a_run_in_one_process_has_nobody_to_watch_it(runs: Path) -> None:

@@ -13,8 +13,6 @@ import hashlib
 import itertools
 import json
 import math
-import multiprocessing
-import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +30,7 @@ from plant_server.physiology import SOURCES
 from pumpbench import __version__
 from pumpbench.calibration import Tuning, tuning_for
 from pumpbench.controller_model import ControllerModel
+from pumpbench.parallel import cpus, pool
 
 BATCH = 16
 """Jobs of one task: long enough that handing it over costs nothing, short enough that a stop loses little."""
@@ -153,9 +152,12 @@ def seed_list(text: str) -> list[int]:
         first, dash, last = part.strip().partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
             raise CampaignError(f"seeds {text!r}: expected numbers and ranges, e.g. 1-10,42")
-        seeds += range(int(first), int(last if dash else first) + 1)
-    if not seeds:
-        raise CampaignError(f"seeds {text!r}: there is none, a range goes from the smaller number to the greater")
+        found = range(int(first), int(last if dash else first) + 1)
+        if not found:
+            raise CampaignError(
+                f"seeds {text!r}: a range goes from the smaller number to the greater, {part.strip()} not"
+            )
+        seeds += found
     return list(dict.fromkeys(seeds))
 
 
@@ -374,7 +376,7 @@ def _finished(
     batches: Sequence[Sequence[Job]], via: str, workers: int | None, cluster: str | None
 ) -> Iterator[list[dict[str, Any]]]:
     """The rows of every batch, as they come."""
-    count = min(workers or os.cpu_count() or 1, len(batches))
+    count = min(workers or cpus(), len(batches))
     if cluster is None and count == 1:
         for batch in batches:
             yield _run_batch(batch, via, programs())
@@ -392,9 +394,8 @@ def _finished(
 @contextlib.contextmanager
 def _executor(count: int, cluster: str | None) -> Iterator[concurrent.futures.Executor]:
     if cluster is None:
-        # spawned, not forked: the parent may have threads (a progress bar, numba's)
-        with concurrent.futures.ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-            yield pool
+        with pool(count) as processes:
+            yield processes
         return
     try:
         from distributed import Client  # noqa: PLC0415

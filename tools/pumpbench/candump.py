@@ -64,7 +64,9 @@ def _parse_line(line: str) -> LogLine:
     if stamp[0] != "(" or stamp[-1] != ")" or direction not in ([], ["R"], ["T"]):
         raise ValueError(line)
     time_s = float(stamp[1:-1])
-    ident, _, payload = frame.partition("#")
+    ident, hash_, payload = frame.partition("#")
+    if not hash_:
+        raise ValueError(line)
     can_id = int(ident, 16)
     if len(ident) == 8 and not can_id & CAN_ERR_FLAG:
         can_id |= CAN_EFF_FLAG

@@ -66,6 +66,8 @@ class Instant:
             raise ForkError(f"{name}@{at}: {error}") from None
         if time % STEP_SECONDS:
             raise ForkError(f"{name}@{at}: the instants of a run are 5 min apart; give a multiple, e.g. {_near(time)}")
+        if "steps" not in info:
+            raise ForkError(f"{name}: its run.json does not say how long the run was; was its bus only listened to?")
         last = int(info["steps"])
         if time > last * STEP_SECONDS:
             raise ForkError(f"{name}@{at}: the run has instants from 00:00 to {clock(last * STEP_SECONDS)}")

@@ -21,7 +21,8 @@ from pumpbench import faults as make
 from pumpbench.calibration import MODES
 from pumpbench.faults import AnyFault, call
 from pumpbench.files import write_file
-from pumpbench.probe import Probe, Verdict, in_parallel, judge
+from pumpbench.parallel import in_parallel
+from pumpbench.probe import Probe, Verdict, judge
 
 CASES = "cases.jsonl"
 SHRINK_AT_MOST = 150
@@ -301,16 +302,20 @@ class Log:
         self.done: dict[int, dict[str, Any]] = {}
         if self._path.exists():
             self._read(heading)
-        else:
+        if not self._path.exists() or not self._path.stat().st_size:
             folder.mkdir(parents=True, exist_ok=True)
             self._append(heading)
 
     def _read(self, heading: dict[str, Any]) -> None:
-        for number, line in enumerate(self._path.read_text(encoding="utf-8").splitlines(), 1):
+        text = self._path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]
+        if whole != text:  # the last line was cut off, and the next one must not be written behind it
+            write_file(self._path, whole.encode())
+        for number, line in enumerate(whole.splitlines(), 1):
             try:
                 entry = json.loads(line)
             except ValueError:
-                entry = None  # the last one may be cut off
+                raise HuntError(f"{self._path}:{number}: not a verdict: {line[:60]!r}") from None
             if number == 1 and entry != heading:
                 raise HuntError(f"{self._path} is of another hunt ({entry}); choose another --out")
             if number > 1 and isinstance(entry, dict) and "case" in entry:

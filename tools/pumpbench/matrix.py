@@ -7,6 +7,7 @@ from plant_server.physiology import cohort
 from pumpbench import probe
 from pumpbench.calibration import MODES
 from pumpbench.catalogue import Entry, entries
+from pumpbench.parallel import in_parallel
 from pumpbench.probe import Probe, Verdict
 
 RUNS_TO_TELL = 7
@@ -67,7 +68,7 @@ def run(
     probes = [
         Probe(adults[(seed - 1) % len(adults)], mode, seed, faults=(entry.fault,)) for entry, mode, seed in places
     ]
-    verdicts = probe.in_parallel(probe.judge, probes, jobs, lambda done: told(done, len(probes)))
+    verdicts = in_parallel(probe.judge, probes, jobs, lambda done: told(done, len(probes)))
     return [Cell(*place, verdict) for place, verdict in zip(places, verdicts, strict=True)]
 
 

@@ -1,10 +1,8 @@
-"""One run with faults against its twin without them, and many of them at once: for the matrix and the hunt."""
+"""One run with faults against its twin without them: for the matrix and the hunt."""
 
 import functools
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,11 +21,6 @@ SIGNS = {
 
 LOW, HIGH = 54.0, 250.0
 """mg/dL."""
-
-ENTRIES_PER_ROUND = 4
-
-Item = TypeVar("Item")
-Answer = TypeVar("Answer")
 
 
 class Probe(NamedTuple):
@@ -145,34 +138,6 @@ def _compiled_twin(probe: Probe) -> tuple[float, float]:
     glucose = np.rint(simulate(case).glucose / GLUCOSE_SCALE) * GLUCOSE_SCALE  # as PLANT_Truth tells it
     low, high = (np.count_nonzero(beyond) * STEP_SECONDS / 60 for beyond in (glucose < LOW, glucose > HIGH))
     return float(low), float(high)
-
-
-def in_parallel(
-    function: Callable[[Item], Answer],
-    items: Sequence[Item],
-    jobs: int,
-    told: Callable[[int], None] = lambda done: None,
-) -> Iterator[Answer]:
-    """The answers in the order of the items, from so many processes; none is started for one job."""
-    if jobs == 1:
-        for done, item in enumerate(items, 1):
-            yield function(item)
-            told(done)
-        return
-    with ProcessPoolExecutor(jobs) as pool:
-        try:
-            for done, answer in enumerate(pool.map(function, items, chunksize=ENTRIES_PER_ROUND), 1):
-                yield answer
-                told(done)
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def jobs_or(jobs: int | None) -> int:
-    """So many, or one per CPU that this process may use."""
-    if jobs is not None:
-        return jobs
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def signs_of(verdicts: Iterable[Verdict]) -> dict[str, int]:

@@ -53,10 +53,10 @@ def matrix(
     """Every fault of the catalogue in every mode: no hazard, and what can be seen is seen. Exit status 1 if not."""
     from pumpbench import matrix as matrices  # noqa: PLC0415
     from pumpbench.files import write_file  # noqa: PLC0415
-    from pumpbench.probe import jobs_or  # noqa: PLC0415
+    from pumpbench.parallel import cpus  # noqa: PLC0415
 
     with progress_bar() as progress:
-        cells = matrices.run(seeds, options.modes(modes), jobs=jobs_or(jobs), told=progress("matrix"))
+        cells = matrices.run(seeds, options.modes(modes), jobs=jobs or cpus(), told=progress("matrix"))
     wrong = [cell for cell in cells if cell.wrong]
     for cell in wrong[:20]:
         errors.print(f"{cell.entry.name}, mode {cell.mode}, seed {cell.seed}: {cell.wrong}", markup=False)
@@ -85,9 +85,9 @@ def hunt(
 ) -> None:
     """Hunt for faults that do harm: random ones, by seed; what fails is shrunk and written as a test. Exit status 1."""
     from pumpbench import hunt as hunts  # noqa: PLC0415
-    from pumpbench.probe import jobs_or  # noqa: PLC0415
+    from pumpbench.parallel import cpus  # noqa: PLC0415
 
-    processes = jobs_or(jobs) if bus in ("inproc", "hub") else 1  # a bus of somebody's has room for one run
+    processes = (jobs or cpus()) if bus in ("inproc", "hub") else 1  # a bus of somebody's has room for one run
     settings = hunts.Settings(out, runs, seed, tuple(options.modes(modes)), processes, bus, firmware, max_low, max_high)
     with progress_bar() as progress:
         result = hunts.run(settings, progress("hunt"), _tell)

@@ -145,9 +145,22 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _info(options: argparse.Namespace) -> dict[str, Any]:
-    """What run.json says of a run that we know nothing of, and what somebody else says of it."""
-    known = versions() | {"bus": options.bus}
-    return known | (json.loads(options.info.read_text(encoding="utf-8")) if options.info else {})
+    """What run.json says of a run that we know nothing of, and what somebody else says of it.
+
+    Raises:
+        ValueError: the file of --info is no JSON object.
+        OSError: it cannot be read.
+    """
+    known: dict[str, Any] = versions() | {"bus": options.bus}
+    if options.info is None:
+        return known
+    try:
+        said = json.loads(options.info.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"--info {options.info} is no JSON: {error}") from None
+    if not isinstance(said, dict):
+        raise ValueError(f"--info {options.info}: expected a JSON object, as run.json has, found {said!r}")
+    return known | said
 
 
 def _origin(options: argparse.Namespace) -> Origin | None:
