@@ -26,6 +26,8 @@ from conftest import ROOT, Pumpbench
 from matplotlib.image import imread
 from pumpbench.closeups import LONGEST, MAX_CLOSE_UPS, CloseUp, close_ups
 from pumpbench.events import AlarmEvent, FaultEvent
+from pumpbench.pictures.lanes import FAULT
+from pumpbench.pictures.summary import write_close_ups
 from pumpbench.recording import viewing
 from pumpbench.recording.columns import wire_bits
 from pumpbench.recording.file import APPLICATION
@@ -35,7 +37,6 @@ from pumpbench.recording.snapshot import Shot, close_up_shots, snapshot
 from pumpbench.recording.tool import RecordingError, quiet_environment, rerun_binary
 from pumpbench.runfolder import RunFolder
 from pumpbench.story import notes
-from pumpbench.summary import FAULT, write_close_ups
 from pumpbench.trace import Trace
 from rerun.chunk import RrdReader
 from synthetic_capture import Loop, as_frames, dropping

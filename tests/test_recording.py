@@ -203,7 +203,8 @@ def test_snapshot_of_nothing(tmp_path: Path) -> None:
 
 def test_only_who_writes_a_recording_imports_rerun() -> None:
     code = (
-        "import sys\nfrom pumpbench import candump, capture, runfolder, story, summary, trace\n"
+        "import sys\nfrom pumpbench import candump, capture, runfolder, story, trace\n"
+        "from pumpbench.pictures import summary\n"
         "from pumpbench.recording import columns, file, scene, snapshot, still\n"
         "print([m for m in ('rerun', 'matplotlib', 'pyarrow', 'cantools') if m in sys.modules])"
     )

@@ -7,7 +7,9 @@ import pytest
 from matplotlib.image import imread
 from pumpbench.capture import Capture
 from pumpbench.events import AlarmEvent, FaultEvent
-from pumpbench.summary import FAULT, MAX_LINES, _alarm_lines, _headline, alarm_bars, binned, write_summary
+from pumpbench.pictures.axes import binned
+from pumpbench.pictures.lanes import FAULT, alarm_bars
+from pumpbench.pictures.summary import MAX_LINES, _alarm_lines, _headline, write_summary
 from pumpbench.trace import Trace
 from synthetic_capture import Loop, dropping
 

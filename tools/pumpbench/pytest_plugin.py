@@ -150,7 +150,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 def _account(item: pytest.Item, outcome: Outcome, number: int, reason: str) -> str:
     """Keep the run with its pictures, and tell of it."""
-    from pumpbench.summary import write_close_ups  # noqa: PLC0415
+    from pumpbench.pictures.summary import write_close_ups  # noqa: PLC0415
 
     name = item.nodeid.replace("/", "-").replace("::", "-").replace(":", "-")
     folder = (Path(_setting(item.config, "out")) / f"{name}-{number}").absolute()

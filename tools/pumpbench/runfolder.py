@@ -122,8 +122,8 @@ class RunFolder:
         Raises:
             NotWritten: a file could not be written (a full disk); what was written stays in `<out>.partial`.
         """
+        from pumpbench.pictures.summary import write_summary  # noqa: PLC0415
         from pumpbench.recording.file import write_recording  # noqa: PLC0415
-        from pumpbench.summary import write_summary  # noqa: PLC0415
 
         info = self._info(frames, info, complete=True)
         trace = Trace.from_frames(frames) if trace is None else trace

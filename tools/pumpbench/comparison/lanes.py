@@ -7,7 +7,7 @@ from typing import Final
 from pumpbench.comparison import account
 from pumpbench.comparison.align import Kind
 from pumpbench.comparison.report import Report
-from pumpbench.summary import Bar, Lane, lanes_of
+from pumpbench.pictures.lanes import Bar, Lane, lanes_of
 
 COLOURS: Final = ("#2f7fd6", "#e07b00")
 """Of A and of B, in pictures and recordings alike; both can be read on white and on black."""

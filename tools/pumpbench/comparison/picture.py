@@ -11,7 +11,8 @@ import numpy as np
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench.comparison.lanes import APART, COLOURS, PARTED, WIDTHS, message_lanes, state_lanes
 from pumpbench.comparison.report import Report
-from pumpbench.summary import LONG_RUN, binned, draw_lanes, legend, time_axis
+from pumpbench.pictures.axes import LONG_RUN, binned, legend, time_axis
+from pumpbench.pictures.lanes import draw_lanes
 from pumpbench.trace import Trace
 
 if TYPE_CHECKING:

@@ -2,10 +2,10 @@
 
 from can_bus.faults.nodes import MemoryState
 from can_bus.lockstep import Node
-from firmware_sim.firmware import NVM_BYTES, NVM_WORDS, Cause, Firmware
-from firmware_sim.nvm import ERASED, RamMemory
+from firmware_sim.firmware import NVM_BYTES, Firmware
+from firmware_sim.nvm import RamMemory
 from pumpbench.conformance.device import InProcess
-from pumpbench.rig.power import tear
+from pumpbench.rig.power import erase, powered_on
 
 
 def reference() -> InProcess:
@@ -13,10 +13,9 @@ def reference() -> InProcess:
     memory = RamMemory(NVM_BYTES)
 
     def build(state: MemoryState | None) -> Node:
-        if state == "torn":
-            tear(memory, NVM_WORDS)
-        elif state != "kept":
-            memory.write(0, bytes([ERASED]) * memory.size)
-        return Firmware(memory, Cause.POWER_ON if state in (None, "kept") else Cause.BROWN_OUT)
+        if state is not None:
+            return powered_on(memory, state)
+        erase(memory)
+        return Firmware(memory)
 
     return InProcess(build)

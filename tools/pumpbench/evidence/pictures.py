@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pumpbench.pictures.summary import write_close_ups, write_summary
 from pumpbench.runfolder import SUMMARY
 from pumpbench.story import clock
-from pumpbench.summary import write_close_ups, write_summary
 from pumpbench.trace import Trace
 
 

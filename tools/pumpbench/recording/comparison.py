@@ -21,10 +21,10 @@ from pumpbench.comparison.lanes import (
     words,
 )
 from pumpbench.comparison.report import Report, frame_lines
+from pumpbench.pictures.lanes import Lane
 from pumpbench.recording.columns import Logger
 from pumpbench.recording.file import write_stream
 from pumpbench.story import GREY
-from pumpbench.summary import Lane
 from pumpbench.trace import Trace
 
 if TYPE_CHECKING:

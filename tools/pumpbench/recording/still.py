@@ -8,24 +8,13 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from pumpbench.pictures.axes import legend, time_axis
+from pumpbench.pictures.lanes import FAULT, draw_lanes, lanes_of
+from pumpbench.pictures.summary import CGM, COMMANDED, DELIVERED, PLASMA, PRAM, TRUTH, write_summary
 from pumpbench.recording.columns import BIT_RATE, per_step, wire_bits
 from pumpbench.recording.scene import FRAME_MS
 from pumpbench.runfolder import METRICS, RunFolder
 from pumpbench.story import title
-from pumpbench.summary import (
-    CGM,
-    COMMANDED,
-    DELIVERED,
-    FAULT,
-    PLASMA,
-    PRAM,
-    TRUTH,
-    draw_lanes,
-    lanes_of,
-    legend,
-    time_axis,
-    write_summary,
-)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

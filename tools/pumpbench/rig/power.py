@@ -12,6 +12,7 @@ from can_bus.frame import Frame
 from firmware_sim.nvm import ERASED, HEADER_WORDS, FileMemory, Memory, RamMemory, bank_size
 
 if TYPE_CHECKING:
+    from firmware_sim.firmware import Firmware
     from pumpbench.rig.processes import Child
 
 
@@ -36,13 +37,33 @@ def tear(memory: Memory, words: int) -> None:
     memory.write((1 - newest) * size, begun + bytes([ERASED]) * (size - half))
 
 
+def erase(memory: Memory) -> None:
+    """Leave the memory blank."""
+    memory.write(0, bytes([ERASED]) * memory.size)
+
+
+def powered_on(memory: Memory, state: MemoryState) -> "Firmware":
+    """The reference firmware after its power has come back.
+
+    Args:
+        memory: its own, to which `state` is done first.
+        state: what the loss of power has made of it.
+    """
+    from firmware_sim.firmware import NVM_WORDS, Cause, Firmware  # noqa: PLC0415
+
+    if state == "torn":
+        tear(memory, NVM_WORDS)
+    elif state == "lost":
+        erase(memory)
+    return Firmware(memory, Cause.POWER_ON if state == "kept" else Cause.BROWN_OUT)
+
+
 class InProcess:
     """The reference firmware in this process, with a memory that outlives it."""
 
     def __init__(self) -> None:
-        from firmware_sim.firmware import NVM_BYTES, NVM_WORDS, Firmware  # noqa: PLC0415
+        from firmware_sim.firmware import NVM_BYTES, Firmware  # noqa: PLC0415
 
-        self._words = NVM_WORDS
         self._memory = RamMemory(NVM_BYTES)
         self.firmware: Firmware = Firmware(self._memory)
         self.said: list[Frame] = []  # by a firmware that has just started
@@ -57,13 +78,7 @@ class InProcess:
 
     def start(self, memory: MemoryState) -> None:
         """A new life."""
-        from firmware_sim.firmware import Cause, Firmware  # noqa: PLC0415
-
-        if memory == "torn":
-            tear(self._memory, self._words)
-        elif memory == "lost":
-            self._memory.write(0, bytes([ERASED]) * self._memory.size)
-        self.firmware = Firmware(self._memory, Cause.POWER_ON if memory == "kept" else Cause.BROWN_OUT)
+        self.firmware = powered_on(self._memory, memory)
         self.said += self.firmware.start()
 
     def freeze(self) -> None:

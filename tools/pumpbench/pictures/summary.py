@@ -1,4 +1,4 @@
-"""A run as one picture, with Matplotlib: for a report, a chat, a machine without a display.
+"""A run as one picture.
 
 From top to bottom: true glucose against CGM, insulin commanded against delivered, pramlintide commanded against
 delivered, then lanes for the states of firmware, pump and sensor, for injected faults and for alarms, and the alarms as
@@ -7,15 +7,17 @@ text.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from can_bus.lockstep import STEP_SECONDS
 from pumpbench.closeups import CloseUp, close_ups
-from pumpbench.story import GREEN, LANES, STATE_COLOURS, alarm_spans, clock, state_changes, title
+from pumpbench.pictures.axes import DAY, LONG_RUN, binned, legend, time_axis
+from pumpbench.pictures.lanes import FAULT, PRIORITY, alarm_bars, as_hex, draw_lanes, lanes_of
+from pumpbench.story import GREEN, clock, state_changes, title
 from pumpbench.trace import Trace
 
 if TYPE_CHECKING:
@@ -23,38 +25,13 @@ if TYPE_CHECKING:
 
     Array = NDArray[Any]
 
-HOUR: Final = 3600.0
-DAY: Final = 86400.0
-TRUTH, CGM, COMMANDED, DELIVERED, PLASMA, FAULT = "#30343b", "#2f7fd6", "#1557a8", "#f08a1d", "#7b4fa3", "#d62f2a"
+TRUTH, CGM, COMMANDED, DELIVERED, PLASMA = "#30343b", "#2f7fd6", "#1557a8", "#f08a1d", "#7b4fa3"
 PRAM: Final = "#0b7a75"
-PRIORITY: Final = {"High": "#d62f2a", "Medium": "#e07b00", "Low": "#b79500", "Info": "#6b7280"}
 MAX_LINES: Final = 12
 """Alarm lines at the bottom of the picture; the rest is counted."""
 
 MAX_EVENTS: Final = 6
 """Events told above a close-up."""
-
-MAX_LANES: Final = 5
-"""Lanes of faults, and of alarms; what is left shares one more."""
-
-LONG_RUN: Final = 2.5 * DAY
-"""From here on doses are drawn as means over an hour."""
-
-
-class Bar(NamedTuple):
-    """A coloured stretch [start_s, end_s) of a lane."""
-
-    start_s: float
-    end_s: float
-    text: str
-    colour: Any
-
-
-class Lane(NamedTuple):
-    """A row of bars with a name."""
-
-    name: str
-    bars: list[Bar]
 
 
 def write_summary(
@@ -208,7 +185,7 @@ def _glucose(axis: Any, trace: Trace) -> None:
     before = -near
     for meal in trace.meals:
         raised, before = meal.time_s - before < near and not raised, meal.time_s
-        axis.plot([meal.time_s], [46], marker="^", color=_hex(GREEN), ms=5 if long else 8, clip_on=False, zorder=4)
+        axis.plot([meal.time_s], [46], marker="^", color=as_hex(GREEN), ms=5 if long else 8, clip_on=False, zorder=4)
         if not long:
             axis.annotate(
                 f"{meal.carbs_g:.0f} g",
@@ -220,7 +197,7 @@ def _glucose(axis: Any, trace: Trace) -> None:
                 color="#3b7d45",
             )
     if trace.meals:
-        axis.plot([], [], marker="^", ls="", color=_hex(GREEN), ms=7, label="meal")
+        axis.plot([], [], marker="^", ls="", color=as_hex(GREEN), ms=7, label="meal")
     axis.set_ylabel("glucose [mg/dL]")
     legend(axis)
 
@@ -275,167 +252,6 @@ def _boluses(axis: Any, trace: Trace, drug: str, unit: str, colour: str, *, labe
                 color=colour,
             )
     return float(max(commanded.max(), delivered.max())) * 1.05
-
-
-def binned(time_s: Array, values: Array, every: int) -> tuple[Array, Array]:
-    """Edges and means of bins of `every` steps, over the steps that lead somewhere (all but the last instant)."""
-    values = values[:-1]
-    if not len(values):
-        return np.array([0.0, STEP_SECONDS]), np.array([np.nan])
-    bins = -(-len(values) // every)
-    padded = np.full(bins * every, np.nan)
-    padded[: len(values)] = values
-    table = padded.reshape(bins, every)
-    counts = (~np.isnan(table)).sum(axis=1)
-    means = np.divide(np.nansum(table, axis=1), counts, out=np.full(bins, np.nan), where=counts > 0)
-    edges = time_s[0] + STEP_SECONDS * np.minimum(np.arange(bins + 1) * every, len(values))
-    return edges, means
-
-
-def legend(axis: Any, handles: Sequence[list[Any]] = (), offset: float = 1.01) -> None:
-    """Beside the plot, where it covers no data."""
-    shown = handles or axis.get_legend_handles_labels()
-    if shown[0]:
-        axis.legend(
-            *shown, loc="upper left", bbox_to_anchor=(offset, 1.02), frameon=False, fontsize=9, handlelength=1.6
-        )
-
-
-# --------------------------------------------------------------------------------------------------------------- lanes
-
-
-def lanes_of(trace: Trace) -> list[Lane]:
-    """States of firmware, pump and sensor, injected faults and alarms as rows of bars."""
-    end_s = float(trace.time_s[-1]) if len(trace) else 0.0
-    lanes = []
-    names = [lane for lane in LANES if lane[0] != "CtrlMode"]
-    for signal, what in (("InsulinOcclusion", "insulin line"), ("PramOcclusion", "pramlintide line")):
-        if np.nan_to_num(trace.get(signal)).any():
-            names.append((signal, "PUMP_Status", what))
-    for signal, message, what in names:
-        changes = state_changes(trace, signal, message)
-        if not changes:
-            continue
-        ends = [time_s for time_s, _ in changes[1:]] + [end_s]
-        colours = STATE_COLOURS[signal]
-        bars = [
-            Bar(time_s, end, text, _hex(colours.get(text, (150, 150, 150))))
-            for (time_s, text), end in zip(changes, ends, strict=True)
-            if text and end > time_s
-        ]
-        lanes.append(Lane(what, bars))
-    faults: dict[str, list[Bar]] = {}
-    for span in trace.fault_spans():
-        faults.setdefault(span.label, []).append(Bar(span.start_s, span.end_s, span.label, FAULT))
-    lanes += [Lane(f"fault {bars[0].text.split(' ')[0]}", bars) for bars in list(faults.values())[:MAX_LANES]]
-    if len(faults) > MAX_LANES:
-        lanes.append(Lane("more faults", [bar for bars in list(faults.values())[MAX_LANES:] for bar in bars]))
-    alarms: dict[str, list[Bar]] = {}
-    for bar in alarm_bars(trace, end_s):
-        alarms.setdefault(bar.text, []).append(bar)
-    lanes += [Lane(f"alarm {code}", bars) for code, bars in list(alarms.items())[:MAX_LANES]]
-    if len(alarms) > MAX_LANES:
-        lanes.append(Lane("more alarms", [bar for bars in list(alarms.values())[MAX_LANES:] for bar in bars]))
-    return lanes
-
-
-def alarm_bars(trace: Trace, end_s: float) -> list[Bar]:
-    """Each alarm from its first frame until it is over or, at the latest, until `end_s` (simulated seconds)."""
-    return [
-        Bar(span.start_s, min(span.end_s, end_s), span.code, PRIORITY.get(span.priority, "#6b7280"))
-        for span in alarm_spans(trace)
-    ]
-
-
-def draw_lanes(axis: Any, lanes: Sequence[Lane], span_s: float) -> None:
-    """Draw rows of bars into an axis of `span_s` simulated seconds; a name that does not fit goes beside its bar."""
-    axis.set_ylim(max(len(lanes), 1) - 0.45, -0.55)
-    axis.set_yticks(range(len(lanes)), [lane.name for lane in lanes], fontsize=8)
-    axis.tick_params(axis="y", length=0)
-    for side in ("top", "right", "left"):
-        axis.spines[side].set_visible(False)
-    unnamed: dict[str, Any] = {}  # states whose bars are too short for their name
-    points = 0.744 * 1600 * 72 / 100  # width of the axis
-    for row, lane in enumerate(lanes):
-        is_fault, is_alarm = "fault" in lane.name, "alarm" in lane.name
-        free_from = -np.inf
-        for bar in lane.bars:
-            width = max(bar.end_s - bar.start_s, 0.0015 * span_s)
-            axis.broken_barh([(bar.start_s, width)], (row - 0.42, 0.84), facecolors=[bar.colour], lw=0)
-            needed = 5.4 * len(bar.text) / points * span_s
-            if needed < width:
-                if bar.start_s >= free_from:
-                    axis.text(
-                        bar.start_s + width / 2, row, bar.text, ha="center", va="center", fontsize=8, color="white"
-                    )
-                    free_from = bar.start_s + width
-            elif is_fault or lane.name == "more alarms":
-                if bar.start_s >= free_from:
-                    _beside(axis, row, bar, width, lane.bars, needed)
-                    free_from = bar.start_s + width + needed
-            elif not is_alarm:
-                unnamed.setdefault(bar.text, bar.colour)
-    if unnamed:
-        patches = [_patch(colour) for colour in unnamed.values()]
-        axis.legend(
-            patches,
-            list(unnamed),
-            loc="upper left",
-            bbox_to_anchor=(1.005, 1.06),
-            frameon=False,
-            fontsize=8,
-            handlelength=1.0,
-            handleheight=0.8,
-            labelspacing=0.25,
-            ncols=2 if len(unnamed) > 6 else 1,
-            columnspacing=0.8,
-        )
-
-
-def _beside(axis: Any, row: int, bar: Bar, width: float, bars: Iterable[Bar], needed: float) -> None:
-    after = bar.start_s + width
-    if not any(after <= other.start_s < after + needed for other in bars):
-        axis.text(after, row, f" {bar.text}", ha="left", va="center", fontsize=8, color=bar.colour)
-
-
-def _patch(colour: Any) -> Any:
-    from matplotlib.patches import Patch  # noqa: PLC0415
-
-    return Patch(facecolor=colour)
-
-
-def _hex(colour: tuple[int, int, int]) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
-
-
-def time_axis(axis: Any, start_s: float, end_s: float) -> None:
-    """Label an axis of simulated seconds as people read time: hh:mm, days in long runs."""
-    span = end_s - start_s
-    axis.set_xlim(start_s - 0.004 * span, end_s + 0.004 * span)
-    if span <= 1.5 * HOUR:
-        step = 600.0
-    elif span <= 5 * HOUR:
-        step = HOUR / 2
-    elif span <= 9 * HOUR:
-        step = HOUR
-    elif span <= 1.5 * DAY:
-        step = 2 * HOUR
-    elif span <= LONG_RUN:
-        step = 6 * HOUR
-    else:
-        step = DAY * max(1, round(span / DAY / 20))
-    ticks = np.arange(np.ceil(start_s / step) * step, end_s + 1, step)
-    if step >= DAY:
-        texts = [f"d{tick / DAY:.0f}" for tick in ticks]
-    elif span > 1.2 * DAY:
-        texts = [clock(tick) for tick in ticks]
-    else:
-        texts = [clock(tick).split(" ")[1] for tick in ticks]
-    axis.set_xticks(ticks, texts)
-    where = (
-        "day, from midnight" if step >= DAY else "simulated time, day hh:mm" if span > 1.2 * DAY else "simulated time"
-    )
-    axis.set_xlabel(where, fontsize=9, labelpad=2)
 
 
 # --------------------------------------------------------------------------------------------------------------- lines
