@@ -348,7 +348,17 @@ def keep(found: Found, seed: int, folder: Path) -> Path:
 
 
 class Settings(NamedTuple):
-    """A hunt as asked for."""
+    """A hunt as asked for.
+
+    Attributes:
+        out: folder of the verdicts and of the tests.
+        runs: cases, from number 0 on.
+        seed: of everything that is drawn.
+        modes: to draw from.
+        jobs: processes.
+        bus, firmware: of every run.
+        max_low, max_high: minutes below 54 and above 250 mg/dL, more than the twin, that are a failure; None: none are.
+    """
 
     out: Path
     runs: int
@@ -357,9 +367,7 @@ class Settings(NamedTuple):
     jobs: int = 1
     bus: str = "inproc"
     firmware: str | None = None
-    max_low: float | None = (
-        None  # minutes below 54 mg/dL more than the twin that are a failure; None: any number is not
-    )
+    max_low: float | None = None
     max_high: float | None = None
 
 
