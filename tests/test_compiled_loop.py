@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pumpbench import compiled, rig
+from pumpbench import rig
 from pumpbench.benchmark.closed_loop import closed_loop as benchmark
 from pumpbench.calibration import MODES, SAFE, Tuning, calibrate, tuning_for
-from pumpbench.closed_loop import Case, CaseError, LoopError, Result, loop, simulate
+from pumpbench.closed_loop import Case, CaseError, LoopError, Result, compiled, loop, simulate
 from pumpbench.controller_model import ControllerModel, shipped_models
 
 from can_bus import codec

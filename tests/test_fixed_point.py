@@ -11,7 +11,7 @@ import pytest
 from bench import OPEN_LOOP, S2, Bench, calibration
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from pumpbench import compiled
+from pumpbench.closed_loop import compiled
 
 import firmware_sim.firmware
 from firmware_sim.calibration import CORE, parameter_names

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bench import GLUCOSE, NMA, Bench
 from pair import Pair
-from pumpbench import compiled
 from pumpbench.calibration import MODES, tuning_for
+from pumpbench.closed_loop import compiled
 
 import firmware_sim.firmware
 from firmware_sim.bolus import IDS, Boluses, Drug

@@ -34,8 +34,8 @@ from plant_server.scenario import (
 from plant_server.sensor import STATE_OK, STATUS_EVERY, Sensor, SensorSettings, load_sensor
 from plant_server.sensors.ideal import Ideal
 from pumpbench.calibration import MODES, Tuning, calibrate, tuning_for
+from pumpbench.closed_loop.compiled import Words
 from pumpbench.closed_loop.loop import Floats, Plan
-from pumpbench.compiled import Words
 from pumpbench.controller_model import ControllerModel
 
 DAYS_MAX = 100

@@ -24,7 +24,7 @@ from firmware_sim.control.layout import MEAL_CARBS, MEAL_NONE, MEAL_SIMPLE, MEAL
 from firmware_sim.day import HOURS, STEPS_PER_HOUR
 from firmware_sim.ladder import AGE_SAFE_BASAL, SAMPLES_UP, State
 from firmware_sim.meals import CARBS_MAX
-from pumpbench.compiled import Words, helper
+from pumpbench.closed_loop.compiled import Words, helper
 
 NEVER = fw_cgm.NEVER
 SAMPLE_OK, SAMPLE_BELOW, SAMPLE_ABOVE = fw_cgm.STATE_OK, fw_cgm.STATE_BELOW_RANGE, fw_cgm.STATE_ABOVE_RANGE

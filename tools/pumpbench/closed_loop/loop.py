@@ -21,9 +21,8 @@ from plant_server import mechanism, physiology
 from plant_server.chamber import INSULIN, PRAMLINTIDE
 from plant_server.mechanism import DELIVERED, FLUID, MOTOR_WORDS, SUBSTEPS
 from plant_server.scenario import RESCUE_EATING_MINUTES
-from pumpbench import compiled
-from pumpbench.closed_loop import device, pump
-from pumpbench.compiled import Words, helper
+from pumpbench.closed_loop import compiled, device, pump
+from pumpbench.closed_loop.compiled import Words, helper
 
 Floats = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from plant_server import mechanism
 from plant_server.bolus import STROKE_RAW, Phase
 from plant_server.mechanism import BOLUS_DELIVERED, FLUID, HELD, PENDING
 from plant_server.set_point import MILLIUNITS_PER_LSB
-from pumpbench.compiled import Words, helper
+from pumpbench.closed_loop.compiled import Words, helper
 
 begin_bolus = helper(mechanism.begin_bolus)
 end_bolus = helper(mechanism.end_bolus)

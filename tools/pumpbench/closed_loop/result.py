@@ -10,8 +10,8 @@ from plant_server import mechanism
 from plant_server.metrics import glycaemic
 from pumpbench.closed_loop import loop
 from pumpbench.closed_loop.case import Case, prepare
+from pumpbench.closed_loop.compiled import Words
 from pumpbench.closed_loop.loop import Floats
-from pumpbench.compiled import Words
 
 
 class LoopError(RuntimeError):
