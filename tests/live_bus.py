@@ -61,10 +61,10 @@ def frames_of(rrd: Path, channel: int = 0) -> list[tuple[float, int, bytes]]:
 
 
 def count_so_far(rrd: Path) -> int:
-    """How many frames are in a recording that still grows; none while its newest part is half written."""
+    """How many frames are in a recording that still grows; none while it is empty, or its newest part half written."""
     try:
         return len(frames_of(rrd))
-    except RuntimeError:
+    except (RuntimeError, ValueError):
         return 0
 
 
