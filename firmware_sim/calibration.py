@@ -180,7 +180,7 @@ class Calibration:
             name = CORE[word.name]
             if name not in values and name not in UNSET:
                 return
-            parameters.append(values.get(name, UNSET.get(name, 0)))
+            parameters.append(values[name] if name in values else UNSET[name])
         self.parameters = parameters
         self._active = values
         self._active_crc = set_crc(self._received)

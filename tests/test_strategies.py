@@ -385,7 +385,7 @@ def test_a_low_in_half_an_hour_is_seen_on_the_line_through_three_samples(
 ) -> None:
     memory = dict(zip(("GLUCOSE", "GLUCOSE_1", "GLUCOSE_2"), samples, strict=True))
     kept = state(TREND=trend, **memory)
-    assert limits.soon_low(kept, parameters(LOW_SUSPEND=700), inputs()) == soon
+    assert limits.soon_low(kept, parameters(LOW_SUSPEND=700)) == soon
     assert rate(900, memory={"TREND": trend, **memory}) == ((200, 8) if soon else (900, 0))
     assert bolus(memory={"TREND": trend, **memory})[:2] == ((0, 8) if soon else (500, 0))
 

@@ -55,12 +55,12 @@ def schedule(parameters: Ints) -> int:
     return round_divide(parameters[BASAL] << 16, 5)
 
 
-def low(state: Ints, parameters: Ints, inputs: Ints) -> bool:
+def low(parameters: Ints, inputs: Ints) -> bool:
     """Whether the newest sample, if there is one in this step, is below the limit of suspension."""
     return inputs[IN_GLUCOSE] >= 0 and inputs[IN_GLUCOSE] < parameters[LOW_SUSPEND]
 
 
-def soon_low(state: Ints, parameters: Ints, inputs: Ints) -> bool:
+def soon_low(state: Ints, parameters: Ints) -> bool:
     """Whether the line through three samples in a row crosses that limit within 30 min (requirement LIM-05)."""
     if state[TREND] < 3:
         return False
@@ -98,10 +98,10 @@ def limit_rate(demand: int, bolus: int, state: Ints, parameters: Ints, inputs: I
     if rise < ceiling:
         ceiling = rise
         bits |= LIMITER_RISE if demand > ceiling else 0
-    if low(state, parameters, inputs) or inputs[IN_LIMIT] == LIMIT_SUSPEND:
+    if low(parameters, inputs) or inputs[IN_LIMIT] == LIMIT_SUSPEND:
         ceiling = 0
         bits |= LIMITER_LOW_GLUCOSE if demand > 0 else 0
-    elif soon_low(state, parameters, inputs) and basal < ceiling:
+    elif soon_low(state, parameters) and basal < ceiling:
         ceiling = basal
         bits |= LIMITER_LOW_GLUCOSE if demand > ceiling else 0
     if inputs[IN_LIMIT] == LIMIT_SCHEDULE and basal < ceiling:
@@ -122,7 +122,7 @@ def limit_bolus(wanted: int, state: Ints, parameters: Ints, inputs: Ints, output
     """The insulin bolus to give for one that a meal asks for, in 0.01 U; 0 = refused."""
     if inputs[IN_LIMIT] != LIMIT_NONE or inputs[IN_BOLUS_STOP] & STOP_INSULIN:
         return 0
-    if low(state, parameters, inputs) or soon_low(state, parameters, inputs):
+    if low(parameters, inputs) or soon_low(state, parameters):
         outputs[OUT_LIMITERS] |= LIMITER_LOW_GLUCOSE
         return 0
     if state[BOLUS_WAIT] > 0:
@@ -150,7 +150,7 @@ def limit_pram_bolus(wanted: int, state: Ints, parameters: Ints, inputs: Ints, o
         return 0
     if wanted == 0 or inputs[IN_LIMIT] != LIMIT_NONE:
         return 0
-    if state[GLUCOSE] < PRAM_LOWEST_GLUCOSE or low(state, parameters, inputs) or soon_low(state, parameters, inputs):
+    if state[GLUCOSE] < PRAM_LOWEST_GLUCOSE or low(parameters, inputs) or soon_low(state, parameters):
         outputs[OUT_LIMITERS] |= LIMITER_LOW_GLUCOSE
         return 0
     if state[PRAM_WAIT] > 0:
