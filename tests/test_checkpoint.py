@@ -56,7 +56,7 @@ def test_it_holds_the_state_of_every_node(disturbed: Outcome, taken: Path) -> No
     waiting = state["bus"]["injector"]["lanes"]["plant"]["waiting"]
     assert waiting and all(each["frame"]["can_id"] == 0x200 and each["time"] >= 41 * 300 for each in waiting)
     assert state["bus"]["clock"]["time"] == 41 * 300
-    assert state["firmware"]["step"] == 40 and state["firmware"]["mode"] == 8
+    assert state["firmware"]["step"] == 40 and state["firmware"]["user"]["mode"] == 8
     memory = RamMemory((taken / "memory.bin").stat().st_size)
     memory.write(0, (taken / "memory.bin").read_bytes())
     record = Nvm(memory, NVM_WORDS).load()
