@@ -51,6 +51,19 @@ def test_ten_equal_values_are_a_stuck_sensor_and_one_other_value_ends_it() -> No
     assert cgm.judge([sample(14, 1501)], 14).glucose == 1501
 
 
+def test_a_limit_of_one_calls_every_value_stuck() -> None:
+    cgm = Cgm()
+    cgm.stuck_limit = 1
+    assert [cgm.judge([sample(k, 1500 + k)], k).glucose for k in range(3)] == [-1] * 3
+
+
+def test_every_refused_sample_of_a_step_is_counted() -> None:
+    cgm = Cgm()
+    assert cgm.judge([sample(0, 0, state=2), sample(1, 0, state=2), sample(2, 1500)], 2).refused == 2
+    cgm.stuck_limit = 2
+    assert cgm.judge([sample(3, 1500), sample(4, 1500)], 4).refused == 2
+
+
 @pytest.mark.parametrize("state", [4, 5])
 def test_beyond_the_range_a_value_may_stay(state: int) -> None:
     cgm = Cgm()
