@@ -27,3 +27,12 @@ def test_the_page_has_every_figure_and_the_machine() -> None:
     text = page.page([figure])
     assert "| `closed-loop/x` | 1,234.5 | patient-days/s | 2.5 | 493.8 | 3 |" in text
     assert page.machine() in text and "numba" in page.machine()
+
+
+def test_what_others_wrote_below_the_figures_stays() -> None:
+    figure = Figure(name="x", value=1.0, unit="1/s", ceiling=2.0, ratio=0.5, runs=1)
+    clone = "\n## A fresh clone\n| `make run` | 0:50 |\n\n## More\ntext\n"
+    before = page.page([figure]) + clone
+    assert page.page([figure], before) == before
+    newer = page.page([Figure(figure, value=3.0)], before)
+    assert newer.endswith(clone) and newer.count("## ") == before.count("## ")

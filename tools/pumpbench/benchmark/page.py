@@ -57,12 +57,13 @@ def number(value: float) -> str:
     return f"{value:,.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
 
 
-def page(figures: Sequence[Figure]) -> str:
-    """The whole page."""
+def page(figures: Sequence[Figure], before: str = "") -> str:
+    """The whole page; what stands behind the figures of the page `before` is others', and stays."""
     rows = [
         f"| `{each['name']}` | {number(each['value'])} | {each['unit']} | {number(each['ceiling'])} "
         f"| {number(each['ratio'])} | {each['runs']} |"
         for each in figures
     ]
     table = ["| figure | value | unit | ceiling or peer | ratio | runs |", "|---|---:|---|---:|---:|---:|", *rows]
-    return f"{INTRO}\n## Measured\n{machine()}\n\n" + "\n".join(table) + "\n"
+    _, heading, kept = before.partition("\n## Measured\n")[2].partition("\n## ")
+    return f"{INTRO}\n## Measured\n{machine()}\n\n" + "\n".join(table) + f"\n{heading}{kept}"

@@ -35,7 +35,8 @@ def benchmark(
     if json_file:
         Path(json_file).write_text(as_json(figures) + "\n", encoding="utf-8")
     if markdown:
-        markdown.write_text(page(figures), encoding="utf-8")
+        before = markdown.read_text(encoding="utf-8") if markdown.exists() else ""
+        markdown.write_text(page(figures, before), encoding="utf-8")
     table = Table(box=None, header_style="bold")
     for name in ("figure", "value", "unit", "ceiling", "ratio", "runs"):
         table.add_column(name, justify="left" if name in ("figure", "unit") else "right")
