@@ -4,7 +4,7 @@ The pump turns rates into whole strokes, so that the two differ by less than one
 balance only tells; what counts for doses is what the totals say.
 """
 
-STEPS_PER_HOUR = 12
+from .day import STEPS_PER_HOUR
 
 
 class Balance:

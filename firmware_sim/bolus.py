@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from can_bus.lockstep import Turn
 
-from .pump import accepted_limit
+from .pump import ACCEPTED, DUPLICATE, accepted_limit
 
 SENDS = 3
 """Times a command is sent at most (project's choice)."""
@@ -54,9 +54,6 @@ ACKS = {
     5: (Drug.PRAMLINTIDE, Op.COMMIT),
 }
 """PUMP_Ack.AckFor of the stages; `CANCEL_ACK` names no drug, its id does."""
-
-ACCEPTED, DUPLICATE = 0, 1
-"""PUMP_Ack.AckResult."""
 
 
 class Phase(enum.IntEnum):

@@ -14,7 +14,7 @@ depends on it leaves.
 
 import enum
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import dbc
 from can_bus.codec import Check, Transmitter, message
@@ -37,7 +37,7 @@ from .history import AREA, History, Record
 from .isotp import IsoTp
 from .ladder import AGE_DEGRADED, PUMP_SILENT, Ladder, State
 from .meals import Meals
-from .nvm import Memory, Nvm, NvmError, memory_size
+from .nvm import Kept, Memory, Nvm, NvmError, memory_size
 from .pump import Op, Pump
 from .scheduler import Scheduler, Task
 from .selftest import Failure, check_program, check_ram
@@ -103,16 +103,6 @@ class Counters(NamedTuple):
     nvm_fallbacks: int
     overruns: int
     boots: int
-
-
-class Kept(Protocol):
-    """A part of the device that survives a reset."""
-
-    def save(self) -> list[int]:
-        """Words for the non-volatile memory."""
-
-    def restore(self, words: Iterator[int]) -> None:
-        """Take back what `save` wrote."""
 
 
 class Firmware:

@@ -5,7 +5,7 @@ the older record whole (requirements RST-01 and RST-02).
 """
 
 import binascii
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 MAGIC = 0x504E564D
@@ -26,6 +26,16 @@ class NvmError(ValueError):
 
 class PowerLost(Exception):
     """The supply failed in the middle of a write: what was written so far stays."""
+
+
+class Kept(Protocol):
+    """A part of the device that survives a reset."""
+
+    def save(self) -> list[int]:
+        """Words for the non-volatile memory."""
+
+    def restore(self, words: Iterator[int]) -> None:
+        """Take back what `save` wrote."""
 
 
 class Memory(Protocol):
