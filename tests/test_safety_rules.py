@@ -57,11 +57,31 @@ def test_a_limit_of_one_calls_every_value_stuck() -> None:
     assert [cgm.judge([sample(k, 1500 + k)], k).glucose for k in range(3)] == [-1] * 3
 
 
-def test_every_refused_sample_of_a_step_is_counted() -> None:
+WARM_UP = 2
+AGAIN = sample(0, 1500) | {"CgmSampleStep": 4}
+
+
+@pytest.mark.parametrize(
+    ("samples", "told"),
+    [
+        ([sample(1, 0, WARM_UP), sample(2, 0, WARM_UP), sample(3, 1500)], {"refused": 2, "glucose": 1500}),
+        ([AGAIN, AGAIN, sample(1, 1510)], {"repeated": 2, "glucose": 1510}),
+        ([sample(1, 3000), sample(2, 4500), sample(3, 1500)], {"refused": 2, "glucose": 1500}),  # two jumps
+        ([sample(1, 1500), sample(2, 1500), sample(3, 1510)], {"refused": 1, "glucose": 1510}),  # the third in a row
+        ([sample(2, 1510), sample(4, 1520)], {"missing": 2, "glucose": 1520}),
+        ([sample(1, 0, WARM_UP), sample(3, 1510)], {"refused": 1, "missing": 1, "glucose": 1510}),
+        ([sample(1, 3000), sample(2, 4500), sample(4, 1510)], {"refused": 2, "missing": 1, "glucose": 1510}),
+    ],
+)
+def test_of_several_samples_in_a_step_each_is_counted_and_the_last_good_one_used(
+    samples: list[dict[str, int]], told: dict[str, int]
+) -> None:
     cgm = Cgm()
-    assert cgm.judge([sample(0, 0, state=2), sample(1, 0, state=2), sample(2, 1500)], 2).refused == 2
-    cgm.stuck_limit = 2
-    assert cgm.judge([sample(3, 1500), sample(4, 1500)], 4).refused == 2
+    cgm.stuck_limit = 3
+    cgm.judge([sample(0, 1500)], 0)
+    verdict = cgm.judge(samples, 4)
+    counts = ("refused", "repeated", "missing", "glucose")
+    assert {name: getattr(verdict, name) for name in counts} == dict.fromkeys(counts, 0) | told
 
 
 @pytest.mark.parametrize("state", [4, 5])
