@@ -40,7 +40,17 @@ def test_a_reset_forgets() -> None:
     balance = Balance(500)
     balance.account(0, 0, 501)
     assert balance.off(0)
-    balance.reset()
+    for _ in range(2):
+        balance.reset()
+        balance.account(1, 0, 501)  # a twelfth of a unit below 501
+        assert not balance.off(0)
+        balance.account(11, 0, 1)
+        assert balance.off(0)
+
+
+def test_it_begins_with_nothing() -> None:
+    balance = Balance(500)
+    balance.account(1, 0, 501)
     assert not balance.off(0)
 
 
