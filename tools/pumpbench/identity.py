@@ -1,5 +1,6 @@
 """What was tested, and with what: the part of a result that says which firmware and which bench it is of."""
 
+import functools
 import hashlib
 import importlib.metadata
 import platform
@@ -29,8 +30,14 @@ def versions() -> dict[str, Any]:
         "protocol": ".".join(map(str, dbc.protocol_version())),
         "dbc_crc32": f"{dbc.crc32():08x}",
         "python": platform.python_version(),
-        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "packages": dict(_packages()),
     }
+
+
+@functools.cache
+def _packages() -> dict[str, str]:
+    """Searching the installed packages costs as much as some steps of a run: once is enough."""
+    return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
 def other_dbc(info: Mapping[str, Any]) -> str | None:
