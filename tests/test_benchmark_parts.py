@@ -1,5 +1,6 @@
 """The benchmark's parts run and are what they are called, and the page is made of the figures."""
 
+import pytest
 from pumpbench.benchmark import beside, page, parts
 from pumpbench.benchmark.figure import Figure
 
@@ -16,6 +17,7 @@ def test_every_part_gives_a_figure_with_its_ceiling() -> None:
         assert each["value"] > 0 and each["ceiling"] > 0 and each["ratio"] > 0, each["name"]
 
 
+@pytest.mark.nightly
 def test_a_recorder_beside_the_loop() -> None:
     found = beside.figures(days=1, runs=1)
     assert [each["name"] for each in found] == ["recorder/beside", "recorder/watched"]

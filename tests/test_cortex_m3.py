@@ -34,6 +34,8 @@ from test_c_firmware import (
 
 from can_bus.frame import Frame
 
+SEEDS = (0, 1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(2, 5)))
+
 RUN = SOURCE / "cortex_m3" / "run.py"
 WITH_ARM = ROOT / "tools" / "with_arm"
 NOT_TO_BE_HAD = 125
@@ -128,13 +130,13 @@ def test_a_bench_that_was_killed_left_the_channel_open(port: serial.Serial) -> N
     assert [frame for frame in found if frame == found[0]][:4] == [found[0]] * 4  # two starts and two roll calls
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_disturbed_day_ends_as_with_the_reference(port: serial.Serial, seed: int) -> None:
     heard = [frame for frame in disturbed(vector()[0], seed) if not frame.is_error]  # of which slcan has none
     assert comparable(answers(port, heard)) == comparable(of_reference(heard))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_any_calibration_gives_the_echoes_and_the_doses_of_the_reference(port: serial.Serial, seed: int) -> None:
     """Products of 64 bits, their saturation and their rounding are another machine's here."""
     heard = flashed(vector()[0], any_calibration(random.Random(seed)))
@@ -263,6 +265,7 @@ def fortnight(*arguments: str | Path) -> Iterator["subprocess.Popen[str]"]:
             running.terminate()
 
 
+@pytest.mark.nightly
 def test_a_killed_emulator_ends_the_run(build: Path, runs: Path) -> None:
     emulated = f"{sys.executable} {RUN} --kernel {build / 'fw.elf'} {{bus}}"
     with fortnight("--firmware", emulated, "--out", runs / "out") as running:

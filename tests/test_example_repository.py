@@ -25,6 +25,7 @@ def run(folder: Path, firmware: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
 
 
+@pytest.mark.nightly
 def test_its_tests_pass_on_the_reference(copied: Path) -> None:
     done = run(copied, f"{sys.executable} -m firmware_sim --bus {{bus}}")
     assert done.returncode == 0, done.stdout

@@ -159,6 +159,7 @@ def fault_file(folder: Path, given: list[object]) -> Path:
     return path
 
 
+@pytest.mark.nightly
 def test_on_a_hub_the_same_bytes(disturbed: Outcome, pumpbench: Pumpbench, runs: Path) -> None:
     done = pumpbench(*SIX_HOURS, "--faults", fault_file(runs, DISTURBED), "--out", "whole")
     assert done.returncode == 0, done.stderr

@@ -82,6 +82,7 @@ def test_a_firmware_killed_again_and_again_does_its_run(tmp_path: Path) -> None:
         end(device, bench)
 
 
+@pytest.mark.nightly
 @pytest.mark.timeout(3600)
 def test_a_plant_that_is_killed_takes_everybody_with_it(tmp_path: Path) -> None:
     """Nobody hangs, everybody says so, and in what was recorded until then every stroke is accounted for."""

@@ -181,7 +181,9 @@ def connects(port: int) -> bool:
 # ---------------------------------------------------------------------------------------------------------- its end
 
 
-@pytest.mark.parametrize(("number", "watched"), [(signal.SIGTERM, True), (signal.SIGINT, False)])
+@pytest.mark.parametrize(
+    ("number", "watched"), [(signal.SIGTERM, True), pytest.param(signal.SIGINT, False, marks=pytest.mark.nightly)]
+)
 def test_asked_to_end_it_writes_what_there_is(number: signal.Signals, watched: bool, bus: Bus) -> None:
     with bus.recorder(*(["--serve", str(free_port())] if watched else [])) as process:
         bus.say(HALF)
@@ -203,7 +205,7 @@ def test_what_was_said_before_the_signal_is_heard(bus: Bus) -> None:
     check_partial(bus)
 
 
-@pytest.mark.parametrize("watched", [False, True])
+@pytest.mark.parametrize("watched", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_killed_it_leaves_what_it_heard(watched: bool, bus: Bus, pumpbench: Pumpbench) -> None:
     with bus.recorder(*(["--serve", str(free_port())] if watched else [])) as process:
         bus.say(HALF)
@@ -315,7 +317,7 @@ def small_disk(runs: Path) -> Iterator[Callable[[str], list[str]]]:
     yield command
 
 
-@pytest.mark.parametrize(("watched", "size"), [(False, "8k"), (True, "200k")])
+@pytest.mark.parametrize(("watched", "size"), [pytest.param(False, "8k", marks=pytest.mark.nightly), (True, "200k")])
 def test_a_full_disk_is_told_and_stops_nobody_else(
     watched: bool, size: str, bus: Bus, small_disk: Callable[[str], list[str]]
 ) -> None:

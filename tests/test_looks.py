@@ -304,6 +304,7 @@ def test_the_viewer_draws_every_layout_and_no_view_complains(run: RunFolder, tmp
     assert reds(shots[4].path) > 1000  # that of the alarm of high priority
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("vulkan")
 def test_the_viewer_draws_a_window_and_a_single_view(run: RunFolder, tmp_path: Path) -> None:
     shots = [

@@ -1,8 +1,8 @@
 """`python -m pumpbench` out of a process that has imported already what most commands need.
 
 Two of the three seconds of a short command are imports, and the tests give hundreds. A command is a process of its own
-all the same, with its own directory, environment, output and exit status; only the imports are shared. What starts
-threads when it is imported (rerun, pyarrow) is not among them, for a fork copies no thread.
+all the same, with its own directory, environment, output and exit status; only the imports are shared. rerun is not
+among them: it starts threads of its own when it is imported, and a fork copies no thread.
 """
 
 import importlib
@@ -17,7 +17,15 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-PRELOADED = ("matplotlib.backends.backend_agg", "matplotlib.figure", "pumpbench.rig", "rich.console", "typer")
+PRELOADED = (
+    "matplotlib.backends.backend_agg",
+    "matplotlib.figure",
+    "pandas",
+    "pumpbench.rig",
+    "pyarrow.parquet",
+    "rich.console",
+    "typer",
+)
 
 REQUEST = 1 << 20
 """Most bytes of arguments and environment."""

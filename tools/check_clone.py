@@ -33,10 +33,8 @@ STEPS = {
 
 def environment(home: Path) -> dict[str, str]:
     """Of a machine that has Python, make and a compiler, and nothing of ours."""
-    tools = home / "bin"
-    tools.mkdir()
-    (tools / "python3").symlink_to(Path(sys.executable).resolve())
-    variables = {"HOME": str(home), "PATH": f"{tools}:{SYSTEM}", "LANG": "C.UTF-8", "CI": "true"}
+    python = Path(sys.executable).resolve().parent
+    variables = {"HOME": str(home), "PATH": f"{python}:{SYSTEM}", "LANG": "C.UTF-8", "CI": "true"}
     return variables | {name: value for name, value in os.environ.items() if name.startswith(NETWORK)}
 
 
