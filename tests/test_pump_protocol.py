@@ -237,6 +237,21 @@ def test_what_was_asked_for() -> None:
     assert pump.asked(BASAL) == (1200, 1200)
 
 
+@pytest.mark.parametrize("first", ["status", "totals"])
+def test_the_pump_is_heard_when_status_and_totals_have_come(first: str) -> None:
+    """Requirement RST-03: before that nothing is commanded."""
+    pump = Pump()
+    status = {"PumpState": 1, "InsulinOcclusion": 0, "InsulinReservoir": 99, "PramOcclusion": 0, "PramReservoir": 99}
+    assert not pump.heard
+    for what in (first, "totals" if first == "status" else "status"):
+        assert not pump.heard
+        if what == "status":
+            pump.status({**status, "PumpLastBasalSeq": SEQUENCES}, 3)
+        else:
+            pump.delivered({"PumpBootCount": 0, "InsulinTotal": 500, "PramTotal": 0}, 3, BASAL)
+    assert pump.heard
+
+
 def test_the_age_is_that_of_what_is_missed_longest() -> None:
     pump = Pump()
     pump.delivered(totals(0), 10, BASAL)
