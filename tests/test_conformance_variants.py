@@ -272,7 +272,13 @@ def report(variant: Variant, patch: Patch) -> Report:
     return check_all(variant.make(patch), [name for name in requirements() if name not in left_out])
 
 
-@pytest.mark.parametrize("variant", VARIANTS, ids=[variant.name for variant in VARIANTS])
+@pytest.mark.parametrize(
+    "variant",
+    [
+        pytest.param(variant, id=variant.name, marks=[pytest.mark.nightly] if number % 2 else [])
+        for number, variant in enumerate(VARIANTS)
+    ],
+)
 def test_a_variant_fails_for_the_right_reason(variant: Variant, monkeypatch: Patch) -> None:
     found = report(variant, monkeypatch)
     failed = {each.requirement.id: each.text for each in found.of(Verdict.FAILED)}

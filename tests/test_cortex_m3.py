@@ -330,7 +330,13 @@ BABBLES = {
 
 
 @pytest.mark.parametrize("way", [pytest.param("hub", marks=pytest.mark.nightly), "serial port"])
-@pytest.mark.parametrize("name", BABBLES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.nightly] if name in ("lines in a run", "frames") else [])
+        for name in BABBLES
+    ],
+)
 def test_a_board_that_babbles_ends_with_a_verdict(
     name: str, way: str, build: Path, pumpbench: Pumpbench, runs: Path
 ) -> None:
