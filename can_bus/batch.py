@@ -11,22 +11,11 @@ import numpy.typing as npt
 from numba import njit
 
 from can_bus import codec
-from can_bus.codec import Transmitter
+from can_bus.codec import Transmitter, crc_table
 from can_bus.frame import RECORD_SIZE, Frame, unpack
 
 Layout = Sequence[tuple[str, Sequence[str], Mapping[str, int]]]
 """Messages in order: name, the signals whose raw values are given each time, and those that never change."""
-
-
-def _crc_table() -> npt.NDArray[np.uint8]:
-    """CRC-8 with polynomial 0x2F, of E2E Profile 2."""
-    table = np.zeros(256, np.uint8)
-    for value in range(256):
-        crc = value
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x2F if crc & 0x80 else crc << 1) & 0xFF
-        table[value] = crc
-    return table
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -97,7 +86,7 @@ class Batch:
         self._frames = np.array([[_signed(cell) for cell in row] for row in frames], np.int64)
         ids = [codec.message(name).data_ids or b"" for name in self._protected]
         self._data_ids = np.array([list(one) for one in ids], np.uint8)
-        self._table = _crc_table()
+        self._table = np.array(crc_table(), np.uint8)
 
     def frames(self, raws: Sequence[int]) -> list[Frame]:
         """The next frames, with these raw values in the order of the layout.

@@ -13,6 +13,7 @@ import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+from e2e.crc import calculate_crc8_h2f
 from e2e.p02 import e2e_p02_check, e2e_p02_protect
 
 import dbc
@@ -237,6 +238,14 @@ def protect(codec: MessageCodec, word: int, counter: int) -> bytes:
     data = bytearray((word | counter << 8).to_bytes(codec.length, "little"))
     e2e_p02_protect(data, codec.data_ids, increment_counter=False)
     return bytes(data)
+
+
+@functools.cache
+def crc_table() -> tuple[int, ...]:
+    """CRC of each byte alone by the polynomial of CHECKSUM, 0x2F, for those who work on many frames at once."""
+    return tuple(
+        calculate_crc8_h2f(bytes([byte ^ 0xFF])) ^ 0xFF for byte in range(256)
+    )  # starts from and ends with 0xFF
 
 
 class Transmitter:

@@ -1,6 +1,7 @@
 """The small parts of the firmware by themselves, at the edges that whole runs seldom meet."""
 
 import pytest
+from test_pump_protocol import BASAL, command
 
 from firmware_sim.allowance import insulin_left, pram_left
 from firmware_sim.bolus import Boluses
@@ -48,15 +49,11 @@ def test_five_resets_within_an_hour_hold_the_schedule(begin: int, last: int, hel
 
 
 def test_a_missing_total_counts_as_the_schedule_where_the_pump_was_left_to_it() -> None:
-    class Silent:
-        def send(self, _name: str, **_values: int) -> None:
-            pass
-
     pump = Pump()
     delivery = Delivery(pump, Boluses())
-    delivery.update({"PumpBootCount": 0, "InsulinTotal": 500, "PramTotal": 0}, 0, 1425, 0)
-    pump.command(Silent(), Op.RESUME_SCHEDULE, 0)  # type: ignore[arg-type]
-    delivery.update(None, 1, 1425, 0)
+    delivery.update({"PumpBootCount": 0, "InsulinTotal": 500, "PramTotal": 0}, 0, BASAL, 0)
+    command(pump, Op.RESUME_SCHEDULE)
+    delivery.update(None, 1, BASAL, 0)
     assert delivery.insulin == 119
 
 

@@ -1,5 +1,7 @@
 """Each limit of the insulin rate at its edge, and several at once: every cut is told, and none that cuts nothing."""
 
+from collections.abc import Callable
+
 import pytest
 
 from firmware_sim.control.layout import (
@@ -55,6 +57,10 @@ class Device:
         """Rate for a demand (both in 0.005 U/h), and the limiters that it tells of."""
         arrays = self.state, self.parameters, self.inputs, self.outputs
         return limit_rate(round(demand * 65536), bolus, *arrays), self.outputs[OUT_LIMITERS]
+
+
+Limit = Callable[[Device], None]
+"""Puts a limit in force."""
 
 
 def largest_rate(device: Device) -> None:
@@ -113,7 +119,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("limit", "ceiling", "told"), CASES)
-def test_a_limit_cuts_what_is_above_it_and_tells_only_of_a_cut(limit, ceiling, told) -> None:  # type: ignore[no-untyped-def]
+def test_a_limit_cuts_what_is_above_it_and_tells_only_of_a_cut(limit: Limit, ceiling: int, told: int) -> None:
     for demand, expected in ((ceiling, (ceiling, 0)), (ceiling + 2**-16, (ceiling, told)), (5000, (ceiling, told))):
         device = Device()
         limit(device)
@@ -150,7 +156,7 @@ def test_every_limit_that_cuts_is_told() -> None:
         (held_at_the_schedule, SCHEDULE, LIMITER_STALE_CGM),
     ],
 )
-def test_a_low_glucose_or_a_doubt_is_told_beside_the_limits(limit, rate, told) -> None:  # type: ignore[no-untyped-def]
+def test_a_low_glucose_or_a_doubt_is_told_beside_the_limits(limit: Limit, rate: int, told: int) -> None:
     device = Device()
     largest_rate(device)
     limit(device)
@@ -168,7 +174,7 @@ def test_a_limit_that_is_no_lower_than_another_one_cuts_nothing_more() -> None:
 
 
 @pytest.mark.parametrize("limit", [total_of_a_day, rise, no_sample])
-def test_of_two_equal_limits_the_first_is_told(limit) -> None:  # type: ignore[no-untyped-def]
+def test_of_two_equal_limits_the_first_is_told(limit: Limit) -> None:
     device = Device()
     largest_rate(device)
     limit(device)
@@ -176,7 +182,7 @@ def test_of_two_equal_limits_the_first_is_told(limit) -> None:  # type: ignore[n
 
 
 @pytest.mark.parametrize("limit", [soon_low, held_at_the_schedule])
-def test_at_the_schedule_a_limit_down_to_the_schedule_tells_nothing(limit) -> None:  # type: ignore[no-untyped-def]
+def test_at_the_schedule_a_limit_down_to_the_schedule_tells_nothing(limit: Limit) -> None:
     device = Device()
     device.parameters[MAX_BASAL] = 0  # never more than the schedule
     limit(device)

@@ -5,6 +5,8 @@ import pytest
 from firmware_sim.pump import SEQUENCES, Op, Pump
 
 BASAL = 1425
+SOUND = {"PumpState": 1, "InsulinOcclusion": 0, "InsulinReservoir": 99, "PramOcclusion": 0, "PramReservoir": 99}
+"""PUMP_Status of a pump without trouble."""
 
 
 class Wire:
@@ -51,10 +53,9 @@ def test_after_a_reset_of_the_pump_nothing_that_was_assumed_comes_off_later(tota
 def test_another_set_point_than_the_last_one_is_told_in_the_second_step_that_shows_it() -> None:
     pump = Pump()
     command(pump, Op.SET_RATE, 240)
-    status = {"PumpState": 1, "InsulinOcclusion": 0, "InsulinReservoir": 99, "PramOcclusion": 0, "PramReservoir": 99}
     told = []
     for step, shown in enumerate((pump._sequence + 9, pump._sequence, *[pump._sequence + 9] * 3, SEQUENCES)):
-        pump.status({**status, "PumpLastBasalSeq": shown}, step)
+        pump.status({**SOUND, "PumpLastBasalSeq": shown}, step)
         told.append(pump.unlike)
     assert told == [False, False, False, True, True, False]
 
@@ -241,12 +242,11 @@ def test_what_was_asked_for() -> None:
 def test_the_pump_is_heard_when_status_and_totals_have_come(first: str) -> None:
     """Requirement RST-03: before that nothing is commanded."""
     pump = Pump()
-    status = {"PumpState": 1, "InsulinOcclusion": 0, "InsulinReservoir": 99, "PramOcclusion": 0, "PramReservoir": 99}
     assert not pump.heard
     for what in (first, "totals" if first == "status" else "status"):
         assert not pump.heard
         if what == "status":
-            pump.status({**status, "PumpLastBasalSeq": SEQUENCES}, 3)
+            pump.status({**SOUND, "PumpLastBasalSeq": SEQUENCES}, 3)
         else:
             pump.delivered({"PumpBootCount": 0, "InsulinTotal": 500, "PramTotal": 0}, 3, BASAL)
     assert pump.heard

@@ -56,8 +56,7 @@ def test_the_environment_is_that_of_the_test(warm: WarmStart, tmp_path: Path, mo
 def test_a_command_that_takes_too_long_is_killed(warm: WarmStart, tmp_path: Path) -> None:
     with pytest.raises(subprocess.TimeoutExpired):
         warm.run(["run", "--days", "14", "--out", "out"], tmp_path, 0.2)
-    (server,) = (each for each in psutil.Process().children() if each.pid == warm.pid)
-    _, alive = psutil.wait_procs(server.children(recursive=True), timeout=20)
+    _, alive = psutil.wait_procs(psutil.Process(warm.pid).children(recursive=True), timeout=20)
     assert not alive
     assert not (tmp_path / "out").exists()
 

@@ -18,9 +18,10 @@ import tempfile
 import time
 from pathlib import Path
 
+from check_wheel import network
+
 ROOT = Path(__file__).resolve().parent.parent
 SYSTEM = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
-NETWORK = ("PIP_", "SSL_", "http", "HTTP", "https", "HTTPS", "no_proxy", "NO_PROXY")
 
 HEADING = "## A fresh clone"
 STEPS = {
@@ -34,8 +35,7 @@ STEPS = {
 def environment(home: Path) -> dict[str, str]:
     """Of a machine that has Python, make and a compiler, and nothing of ours."""
     python = Path(sys.executable).resolve().parent
-    variables = {"HOME": str(home), "PATH": f"{python}:{SYSTEM}", "LANG": "C.UTF-8", "CI": "true"}
-    return variables | {name: value for name, value in os.environ.items() if name.startswith(NETWORK)}
+    return network() | {"HOME": str(home), "PATH": f"{python}:{SYSTEM}", "LANG": "C.UTF-8", "CI": "true"}
 
 
 def timed(command: list[str], place: Path, variables: dict[str, str]) -> float:

@@ -22,6 +22,12 @@ NEWEST = 20
 """The highest minor version that is looked for."""
 
 
+def network() -> dict[str, str]:
+    """What this environment says of where packages are fetched from, and how."""
+    prefixes = ("PIP_", "SSL_", "http", "HTTP", "no_proxy", "NO_PROXY")
+    return {name: value for name, value in os.environ.items() if name.startswith(prefixes)}
+
+
 def run(command: list[str | Path], folder: Path, *, status: int = 0, said: str = "", **variables: str) -> str:
     """Run a command away from this checkout; returns what it said.
 
@@ -29,10 +35,7 @@ def run(command: list[str | Path], folder: Path, *, status: int = 0, said: str =
         SystemExit: its status or its words are not as expected.
     """
     environment = {name: os.environ[name] for name in ("PATH", "PUMPBENCH_CACHE", "LANG") if name in os.environ}
-    environment |= {
-        name: value for name, value in os.environ.items() if name.startswith(("PIP_", "SSL_", "http", "HTTP"))
-    }
-    environment |= {
+    environment |= network() | {
         "HOME": str(folder / "home"),
         "XDG_CACHE_HOME": os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache")),
     }

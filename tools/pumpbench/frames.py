@@ -104,21 +104,10 @@ def concatenated(parts: Sequence[Frames]) -> Frames:
     return Frames(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Frames)))
 
 
-@functools.cache
-def _crc_table() -> Array:
-    table = np.zeros(256, "u1")
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x2F if crc & 0x80 else crc << 1) & 0xFF
-        table[byte] = crc
-    return table
-
-
 def intact(can_id: Array, length: Array, data: Array) -> Array:
     """Which frames have an id and a length of the DBC and, where protected, a fitting checksum (E2E Profile 2)."""
     good = np.zeros(len(can_id), bool)
-    table = _crc_table()
+    table = np.array(codec.crc_table(), "u1")
     for message in codec.messages().values():
         rows = np.flatnonzero((can_id == message.can_id) & (length == message.length))
         if not len(rows):
