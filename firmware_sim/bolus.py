@@ -19,6 +19,9 @@ SENDS = 3
 EXPIRES_AFTER = 1
 """Steps after which Program and Commit are void."""
 
+LIMIT_AT_BOOT = 4000
+"""Raw dose of either drug that the pump is taken to accept until it has said otherwise: the largest of the wire."""
+
 IDS = 65535
 """BolusId runs from 0 to 65534; 65535 is SNA."""
 
@@ -91,7 +94,7 @@ class Boluses:
         self.short = dict.fromkeys(Drug, 0)  # raw, of boluses that ended before they were whole, so far
         self.committed = dict.fromkeys(Drug, 0)  # raw, of boluses whose first Commit was sent in this step
         self.unanswered = 0  # commands that no acknowledgement came for, so far
-        self.limit = {Drug.INSULIN: 4000, Drug.PRAMLINTIDE: 4000}  # what the pump accepts, as it last said
+        self.limit = dict.fromkeys(Drug, LIMIT_AT_BOOT)  # what the pump accepts, as it last said
         self._open: dict[Drug, _Bolus] = {}
         self._states: dict[Drug, dict[str, int]] = {}
         self._heard: set[Drug] = set()

@@ -28,6 +28,9 @@ ACK_INSULIN_RATE, ACK_PRAM_RATE = 1, 8
 
 ACK_RATES = (ACK_INSULIN_RATE, ACK_PRAM_RATE)
 
+RATE_LIMIT_AT_BOOT = 8000
+"""Raw rate of either drug that the pump is taken to accept until it has said otherwise: the largest of the wire."""
+
 ACCEPTED, DUPLICATE, OVER_LIMIT = 0, 1, 3
 """PUMP_Ack.AckResult."""
 
@@ -62,8 +65,8 @@ class Pump:
         self.pram_blocked = False
         self._insulin_fell = False  # the newest total was below an older one, without a reset of the pump
         self._pram_fell = False
-        self.rate_limit = 8000  # raw, what the pump accepts as it last said
-        self.pram_rate_limit = 8000
+        self.rate_limit = RATE_LIMIT_AT_BOOT  # raw, what the pump accepts as it last said
+        self.pram_rate_limit = RATE_LIMIT_AT_BOOT
         self._boot_count: int | None = None
         self._estimated = 0  # mU assumed and not yet covered by a total
         self._commanded_rate: int | None = None  # 0.005 U/h in force by our last command; None = schedule

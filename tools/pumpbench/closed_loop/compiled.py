@@ -99,7 +99,7 @@ def _control() -> _Twins:
 
 
 def twin(plain: Function) -> Function:
-    """The compiled twin of any function of `firmware_sim.control`."""
+    """The compiled twin of a function of the firmware that calls only what is in `firmware_sim.control`."""
     return cast(Function, _control().function(cast(FunctionType, plain)))
 
 

@@ -8,6 +8,7 @@ originals; tests hold every dose against plant and firmware on the bus.
 """
 
 from firmware_sim import cgm as fw_cgm
+from firmware_sim.bolus import LIMIT_AT_BOOT
 from firmware_sim.cgm import (
     ABOVE_RANGE_ACTS_AS,
     AGE_USABLE,
@@ -47,7 +48,7 @@ OPEN, DOSE, REMAINING, LIMIT = range(4)
 """Words of one drug in `firmware_sim.bolus.Boluses`: whether a bolus is not settled, its raw dose, what of it no total
 holds yet, and the largest dose the pump accepts, as it last said."""
 
-BOLUS_AT_BOOT = (0, 0, 0, 4000)
+BOLUS_AT_BOOT = (0, 0, 0, LIMIT_AT_BOOT)
 
 
 # ---- firmware_sim.cgm.Cgm

@@ -16,7 +16,7 @@ import plant_server
 from can_bus.lockstep import STEP_MINUTES
 from firmware_sim import allowance
 from firmware_sim.control import layout
-from firmware_sim.pump import RATE_EXPIRES_AFTER
+from firmware_sim.pump import RATE_EXPIRES_AFTER, RATE_LIMIT_AT_BOOT
 from plant_server import mechanism, physiology
 from plant_server.chamber import INSULIN, PRAMLINTIDE
 from plant_server.mechanism import DELIVERED, FLUID, MOTOR_WORDS, SUBSTEPS
@@ -91,9 +91,6 @@ FIRMWARE, PLANT, HERE = (
 )
 
 STATE_WORDS, INPUT_WORDS, OUTPUT_WORDS = len(layout.STATE), len(layout.INPUTS), len(layout.OUTPUTS)
-
-RATE_LIMIT_AT_BOOT = 8000
-"""`firmware_sim.pump.Pump.rate_limit` until the pump has refused a rate."""
 
 MILLIUNITS_PER_STROKE, PRAM_TOTAL_PER_STROKE = 50, 50
 """A stroke in PUMP_Delivered: 0.05 U in 0.001 U, 0.5 ug in 0.01 ug."""
